@@ -1,7 +1,7 @@
 """Runs the notebooks of docs/tutorials in a folder of their own: `python scripts/run_notebooks.py [NAME ...]`.
 
 Exit status 1 where a cell fails. With `--write` they are saved with what they printed and drew, which is how they are
-committed; with `--seconds` their trainings are shorter. Needs: pip install '.[docs]'.
+committed; with `--seconds` their trainings are shorter and their pictures smaller. Needs: pip install '.[docs]'.
 """
 
 from __future__ import annotations
@@ -38,6 +38,7 @@ def run(name: str, seconds: float | None) -> nbformat.NotebookNode:
     text = (TUTORIALS / f"{name}.ipynb").read_text(encoding="utf-8")
     if seconds is not None:
         text = re.sub(r"(SECONDS = |--max-seconds )\d+", rf"\g<1>{seconds:g}", text)
+        text = re.sub(r"resized\(\d+, \d+\)", "resized(48, 48)", text)
     notebook = nbformat.reads(text, as_version=4)
     with tempfile.TemporaryDirectory() as folder:
         shutil.copytree(

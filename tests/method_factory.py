@@ -25,14 +25,8 @@ from unmix_plugin.trained.trained_scene import TrainedScene
 
 NUM_BANDS = 5
 WAVELENGTHS_NM = [450.0, 500.0, 550.0, 600.0, 650.0]
-CAMERA = Cameras(
-    camera_to_world=torch.tensor([[[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4.0]]]),
-    focal_px=torch.tensor([[20.0, 20.0]]),
-    center_px=torch.tensor([[6.0, 5.0]]),
-    distortion=torch.zeros(1, 4),
-    width=12,
-    height=10,
-)
+POSE = torch.tensor([[[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4.0]]])
+CAMERA = Cameras(POSE, torch.full((1, 2), 20.0), torch.tensor([[6.0, 5.0]]), torch.zeros(1, 4), 12, 10)
 BOX = SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
 CONFIG = UnmixModelConfig(
     num_endmembers=3,
@@ -53,16 +47,8 @@ def make_model(
 ) -> UnmixModel:
     """A model with random parameters of some size, so that its picture isn't uniform."""
     torch.manual_seed(seed)
-    metadata = {
-        "wavelengths_nm": WAVELENGTHS_NM,
-        "illuminant": light,
-        "has_alpha": has_alpha,
-        "grid_resolution": 8,
-        "subpixels": 2,
-        "num_train_views": 3,
-        "pixel_size": 0.087,
-        **(more_metadata or {}),
-    }
+    metadata = {"wavelengths_nm": WAVELENGTHS_NM, "illuminant": light, "has_alpha": has_alpha, "subpixels": 2}
+    metadata |= {"grid_resolution": 8, "num_train_views": 3, "pixel_size": 0.087, **(more_metadata or {})}
     model: UnmixModel = replace(CONFIG, **settings).setup(scene_box=BOX, metadata=metadata)
     with torch.no_grad():
         model.initialise({**initial_data(), **(more_data or {})}, torch.Generator().manual_seed(seed))

@@ -137,9 +137,7 @@ def test_initial_pixels_come_from_opaque_pixels_of_all_training_views(scene_fold
 
 
 @pytest.mark.parametrize(("has_alpha", "power"), [(True, 1.5), (False, 0.0)])
-def test_errors_are_relative_where_alpha_is_known_and_some_pixels_are_much_brighter(
-    scene_folder, has_alpha, power
-):
+def test_errors_are_relative_where_alpha_is_known_and_some_pixels_glare(scene_folder, has_alpha, power):
     scene = replace(make(scene_folder).scene, has_alpha=has_alpha)
     pixels = torch.full((100, 6), 0.05)
     pixels[:20] = 0.5
@@ -158,18 +156,13 @@ def test_the_number_of_rays_can_be_changed(scene_folder):
 
 
 def test_impossible_settings_are_refused():
-    for settings, message in (
-        ({"subpixels": 0}, "subpixels of 1 to 8"),
-        ({"grid_resolution": 4}, "of 8 to 512"),
-    ):
-        with pytest.raises(ConfigError, match=message):
-            replace(CONFIG, **settings)
+    for name, value, said in (("subpixels", 0, "subpixels of 1 to 8"), ("grid_resolution", 4, "of 8 to 512")):
+        with pytest.raises(ConfigError, match=said):
+            replace(CONFIG, **{name: value})
 
 
 @pytest.mark.parametrize(("alpha", "until", "share"), [(True, 0.5, 0.5), (False, "auto", 0.8)])
-def test_rays_a_pixel_grow_after_the_first_part_of_training_at_the_same_number_of_rays(
-    tmp_path, alpha, until, share
-):
+def test_rays_a_pixel_grow_after_the_first_part_of_training(tmp_path, alpha, until, share):
     manager = make(make_scene(tmp_path / "scene", alpha=alpha).root, single_ray_until=until)
     (callback,) = manager.get_training_callbacks()
     pixels = []
@@ -183,9 +176,8 @@ def test_rays_a_pixel_grow_after_the_first_part_of_training_at_the_same_number_o
 
 def scene_record(manager: HyperspectralDataManager) -> SceneRecord:
     values = json.loads(json.dumps(scene_record_to_json(manager)))
-    return SceneRecord(
-        manager.scene_box, values["metadata"], manager.train_cameras, manager.eval_cameras, values["summary"]
-    )
+    cameras = manager.train_cameras, manager.eval_cameras
+    return SceneRecord(manager.scene_box, values["metadata"], *cameras, values["summary"])
 
 
 def test_a_run_goes_on_with_the_scene_as_another_machine_rounds_it(tmp_path):

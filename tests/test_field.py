@@ -62,9 +62,8 @@ def test_only_the_specular_part_depends_on_direction_and_shading_where_the_light
     field = make_field(lit_by_camera=lit_by_camera)
     positions = torch.rand(20, 3) * 2 - 1
     _, features = field.get_density(positions)
-    up, down = (
-        field.get_outputs(positions, torch.tensor([[0.0, 0.0, z]]).repeat(20, 1), features) for z in (1, -1)
-    )
+    along = torch.tensor([[0.0, 0.0, 1.0]]).expand(20, 3)
+    up, down = (field.get_outputs(positions, directions, features) for directions in (along, -along))
     assert_close(up["abundances"], down["abundances"])
     assert_close(up["abundances"], field.abundances_of(features))
     assert ((up["scaled_abundances"] - down["scaled_abundances"]).abs().max() > 1e-3) == lit_by_camera
@@ -74,9 +73,8 @@ def test_only_the_specular_part_depends_on_direction_and_shading_where_the_light
 
 
 def test_the_view_dependent_part_of_a_dark_scene_starts_as_much_darker():
-    bright, dark = (
-        evaluate(make_field(exposure=exposure))[1]["specular_coefficients"] for exposure in (1.0, 100.0)
-    )
+    fields = (make_field(exposure=exposure) for exposure in (1.0, 100.0))
+    bright, dark = (evaluate(field)[1]["specular_coefficients"] for field in fields)
     assert 30 < (bright / dark).median() < 100
 
 
@@ -124,10 +122,8 @@ def test_levels_have_more_rows_where_a_scene_is_many_pixels_large_unless_their_n
     assert sizes == sorted(sizes)
     assert len(set(sizes)) == 4
     assert set(rows(UnmixFieldConfig(log2_rows_per_level=12))) == {12}
-    sharp, blurred = (
-        _cells_of_finest_level(UnmixFieldConfig(cells_per_pixel=2.0), BOX, size) for size in (0.01, 0.04)
-    )
-    assert (sharp, blurred) == (400, 100)
+    fine = UnmixFieldConfig(cells_per_pixel=2.0)
+    assert [_cells_of_finest_level(fine, BOX, size) for size in (0.01, 0.04)] == [400, 100]
     for number in (3, 25):
         with pytest.raises(ConfigError, match="log2-rows-per-level of 4 to 24 or auto"):
             UnmixFieldConfig(log2_rows_per_level=number)

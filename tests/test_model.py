@@ -63,10 +63,8 @@ def test_a_ray_that_misses_the_box_sees_black_and_nothing():
 def test_normals_point_out_of_a_density_that_grows_inwards():
     model = make_model()
     centre = torch.tensor([0.1, -0.2, 0.05])
-    model.field.get_density = lambda positions: (  # type: ignore[method-assign]
-        torch.exp(-4 * (positions - centre).square().sum(-1)),
-        positions,
-    )
+    density = lambda positions: torch.exp(-4 * (positions - centre).square().sum(-1))  # noqa: E731
+    model.field.get_density = lambda positions: (density(positions), positions)  # type: ignore[method-assign]
     rays = make_rays(12)[:11]
     normals = model.renderer.normals(model.field, rays, torch.full((11,), 2.5))
     outward = rays.origins + 2.5 * rays.directions - centre

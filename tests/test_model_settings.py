@@ -82,10 +82,8 @@ def test_given_endmembers_get_the_brightness_of_the_scene(tmp_path):
     """The pixels are materials of the file at 1.9 times its brightness: amounts above 1 would be needed."""
     shapes = np.eye(3, NUM_BANDS, dtype=np.float32) * 0.6 + 0.1
     path = tmp_path / "materials.csv"
-    rows = [
-        ",".join(f"{value:g}" for value in (nm, *shapes[:, band])) for band, nm in enumerate(WAVELENGTHS_NM)
-    ]
-    path.write_text("wavelength,a,b,c\n" + "\n".join(rows) + "\n")
+    rows = np.column_stack([WAVELENGTHS_NM, shapes.T])
+    np.savetxt(path, rows, fmt="%g", delimiter=",", header="wavelength,a,b,c", comments="")
     model = make_model(endmember_init="file", endmember_file=path, train_endmembers=False)
     data = {**initial_data(), "pixels": np.repeat(1.4 * shapes, 40, axis=0) * 0.999}
     with torch.no_grad():

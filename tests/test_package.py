@@ -46,11 +46,8 @@ def metadata_file(wheel, name):
 
 @pytest.mark.slow
 def test_a_wheel_holds_every_file_of_the_package_and_nothing_else(wheel):
-    expected = {
-        path.relative_to(ROOT).as_posix()
-        for path in (ROOT / "unmix_plugin").rglob("*")
-        if path.is_file() and "__pycache__" not in path.parts
-    }
+    paths = (path for path in (ROOT / "unmix_plugin").rglob("*") if path.is_file())
+    expected = {path.relative_to(ROOT).as_posix() for path in paths if "__pycache__" not in path.parts}
     assert {name for name in wheel.namelist() if ".dist-info/" not in name} == expected
 
 
@@ -71,18 +68,15 @@ def test_a_wheel_carries_licence_readme_and_dependency_ranges(wheel):
     assert str(metadata.get_payload()).strip()
     needed = [line for line in metadata.get_all("Requires-Dist", []) if "extra ==" not in line]
     assert any(line.startswith("torch") for line in needed)
-    assert not [line for line in needed if "==" in line], (
-        "a library bounds its dependencies, it does not pin them"
-    )
+    assert not [line for line in needed if "==" in line]  # a library bounds its dependencies, but pins none
     assert "Apache License" in metadata_file(wheel, "licenses/LICENSE")
 
 
 def lines_printed_by(code):
     """Standard output of a fresh interpreter that runs the code."""
     command = [sys.executable, "-c", code]
-    finished = subprocess.run(
-        command, capture_output=True, text=True, errors="replace", check=False, cwd=ROOT
-    )
+    as_text = {"text": True, "errors": "replace"}
+    finished = subprocess.run(command, capture_output=True, check=False, cwd=ROOT, **as_text)
     assert finished.returncode == 0, finished.stderr
     return finished.stdout.splitlines()
 

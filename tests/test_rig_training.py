@@ -1,5 +1,6 @@
 """Training on sensors of different bands and sizes: each pixel is compared with what its own sensor sees."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -104,9 +105,8 @@ def test_more_endmembers_than_channels_start_from_spectra_of_different_shape():
 
 
 def rig_manager(root, **settings) -> HyperspectralDataManager:
-    config = HyperspectralDataManagerConfig(
-        train_num_rays_per_batch=400, grid_resolution=16, single_ray_until=0.0, **settings
-    )
+    settings = {"train_num_rays_per_batch": 400, "single_ray_until": 0.0, **settings}
+    config = HyperspectralDataManagerConfig(grid_resolution=16, **settings)
     return config.setup(data=make_rig(root).root, device=torch.device("cpu"))
 
 
@@ -179,16 +179,13 @@ def test_a_rig_whose_sensors_look_elsewhere_is_named(tmp_path):
     config = HyperspectralDataManagerConfig(grid_resolution=16)
     said = config.setup(data=folder.root, device=torch.device("cpu")).warnings()
     assert any(
-        "of what sensor 'small' sees, the other sensors see 0 %" in warning.replace("0%", "0 %")
-        for warning in said
+        re.search("of what sensor 'small' sees, the other sensors see 0 ?%", warning) for warning in said
     )
 
 
 def test_endmembers_that_a_sensor_cannot_carry_are_named():
     (warning,) = make_model(num_endmembers=3).warnings()
-    assert (
-        "3 endmembers are more than these sensors have channels: colour (2); materials are found" in warning
-    )
+    assert "3 endmembers are more than these sensors have channels: colour (2); materials" in warning
     (warning,) = make_model(num_endmembers=5).warnings()
     assert "spectral (4), colour (2)" in warning
     assert "try --endmembers 4" in warning

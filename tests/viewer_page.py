@@ -37,15 +37,12 @@ class Page:
     pictures: list[tuple[float, int]] = field(default_factory=list)
     """When each picture came (monotonic seconds), and its bytes."""
     last_picture: bytes = b""
-    """The newest picture, PNG or JPEG."""
     last_depth: bytes | None = None
-    """Its depth, PNG."""
     controls: dict[str, dict[str, Any]] = field(default_factory=dict)
     """Controls by their identifier: type and properties."""
     notices: list[tuple[str, str]] = field(default_factory=list)
-    """Titles and texts of notices."""
+    """Titles and texts."""
     downloads: list[str] = field(default_factory=list)
-    """Names of files that were sent."""
     is_closed: bool = False
     storage: dict[str, str] = field(default_factory=dict)
     """What the browser keeps from page to page."""
@@ -84,11 +81,7 @@ class Page:
         self.send("ScenePointerMessage", event_type="click", **ray, screen_pos=((x, y),), modifier=None)
 
     def control(self, label: str) -> str:
-        """Identifier of the control with a label; the newest if there are several.
-
-        Raises:
-            KeyError: there is none.
-        """
+        """Identifier of the control with a label; the newest if there are several."""
         labels = {str(props.get("label")): key for key, props in self.controls.items()}
         if label not in labels:
             raise KeyError(f"{label}; there are {sorted(labels)}")
@@ -103,31 +96,22 @@ class Page:
         self.send("GuiUpdateMessage", uuid=self.control(label), updates={"value": value})
 
     def send(self, kind: str, **content: Any) -> None:
-        """Send any message."""
         self._socket.send(msgspec.msgpack.encode({"type": kind, **content}))
 
     def send_raw(self, data: bytes | str) -> None:
-        """Send anything."""
         self._socket.send(data)
 
     def wait_until(self, holds: Callable[[], bool], timeout_s: float = 120.0) -> None:
-        """Wait for something to become true.
-
-        Raises:
-            TimeoutError: it did not.
-        """
+        """Wait for something to become true; if it does not, TimeoutError."""
         with self._changed:
             if not self._changed.wait_for(holds, timeout_s):
-                raise TimeoutError(
-                    f"{len(self.pictures)} pictures, notices {self.notices}, closed {self.is_closed}"
-                )
+                shown = f"{len(self.pictures)} pictures, notices {self.notices}, closed {self.is_closed}"
+                raise TimeoutError(shown)
 
     def wait_for_notice(self, text: str) -> None:
-        """Wait for a notice that has a text."""
         self.wait_until(lambda: any(text in said for _, said in self.notices))
 
     def wait_for_text(self, *texts: str) -> None:
-        """Wait until the page shows all texts."""
         self.wait_until(lambda: all(text in self.texts for text in texts))
 
     @property
@@ -172,12 +156,8 @@ class Page:
         elif kind == "LocalStorageSetItemMessage":
             self.storage[message["key"]] = message["value"]
         elif kind == "LocalStorageGetItemRequestMessage":
-            self.send(
-                "LocalStorageGetItemResponseMessage",
-                value=self.storage.get(message["key"]),
-                error=None,
-                request_uuid=message["request_uuid"],
-            )
+            answer = {"value": self.storage.get(message["key"]), "request_uuid": message["request_uuid"]}
+            self.send("LocalStorageGetItemResponseMessage", error=None, **answer)
 
 
 def _looking_at_origin(place: tuple[float, float, float]) -> tuple[float, float, float, float]:

@@ -12,6 +12,4 @@ FLAGS = (
 )
 SOFTWARE_GL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 HAS_BROWSER = CHROMIUM is not None and importlib.util.find_spec("playwright") is not None
-NEEDS_BROWSER = pytest.mark.skipif(
-    not HAS_BROWSER, reason="needs the package playwright and the program chromium"
-)
+NEEDS_BROWSER = pytest.mark.skipif(not HAS_BROWSER, reason="needs playwright and the program chromium")

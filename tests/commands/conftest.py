@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.commands.running import SMALL_METHOD, Ended, done, run_of
+from tests.products.few_rays import few_rays
 from unmix_plugin.commands.export import PRODUCTS, export
 from unmix_plugin.commands.train import train
 from unmix_plugin.products.product import RunProduct
@@ -40,9 +41,8 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
 @pytest.fixture(scope="session")
 def solid(tmp_path_factory: pytest.TempPathFactory) -> Trained:
     """A run whose hull is opaque from its first step on, so that there is a surface."""
-    return small_run(
-        tmp_path_factory.mktemp("solid"), "--steps-per-log=5", "--pipeline.model.initial-opacity=0.6"
-    )
+    words = "--steps-per-log=5", "--pipeline.model.initial-opacity=0.6"
+    return small_run(tmp_path_factory.mktemp("solid"), *words)
 
 
 @pytest.fixture
@@ -81,7 +81,15 @@ def exported(solid, tmp_path_factory):
     """A folder of every product."""
     root = tmp_path_factory.mktemp("exported")
     said = {}
-    for name in PRODUCT_NAMES:
-        ended = done(export, *export_words(name, "--run", solid.run, "--output", root / name))
-        said[name] = ended.out
+    with few_rays(8_000):
+        for name in PRODUCT_NAMES:
+            ended = done(export, *export_words(name, "--run", solid.run, "--output", root / name))
+            said[name] = ended.out
     return root, said
+
+
+@pytest.fixture(scope="module")
+def coarse_surfaces():
+    """Quick surfaces for tests that ask no more of them than that they are there."""
+    with few_rays(8_000):
+        yield

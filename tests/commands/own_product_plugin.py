@@ -35,9 +35,8 @@ def _broken():
 
 
 def _with(products, name: str = "rgb-nerf") -> MethodSpecification:
-    return MethodSpecification(
-        replace(rgb_nerf.config, method_name=name), rgb_nerf.description, products=products
-    )
+    config = replace(rgb_nerf.config, method_name=name)
+    return MethodSpecification(config, rgb_nerf.description, products=products)
 
 
 with_product = _with(lambda: (ViewNames(),))

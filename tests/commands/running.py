@@ -34,7 +34,6 @@ class Ended:
 
     @property
     def last_line(self) -> str:
-        """The last line on standard output."""
         return self.out.splitlines()[-1]
 
 

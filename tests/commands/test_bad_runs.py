@@ -17,13 +17,8 @@ from unmix_plugin.commands.render import render
 from unmix_plugin.commands.train import train
 from unmix_plugin.commands.view import view
 
-COMMANDS = [
-    (evaluate, ["--run"]),
-    (export, ["abundances", "--run"]),
-    (render, ["--run"]),
-    (train, ["unmix-nerf", "--load-run"]),
-    (view, ["--run"]),
-]
+COMMANDS = [(evaluate, ["--run"]), (export, ["abundances", "--run"]), (render, ["--run"])]
+COMMANDS += [(train, ["unmix-nerf", "--load-run"]), (view, ["--run"])]
 
 
 def cut_off(name):
@@ -72,10 +67,7 @@ def piped(name):
 
 
 SPOILT = {
-    "settings of an older version": (
-        in_json("config.json", format_version=5),
-        "format 5, written by an older",
-    ),
+    "settings of an old version": (in_json("config.json", format_version=5), "format 5, written by an older"),
     "tensors of NaN": (spoilt_tensors(float("nan")), "has values that are not finite"),
     "tensors of infinity": (spoilt_tensors(float("inf")), "has values that are not finite"),
     "tensors cut off": (cut_off("checkpoints/step-000020.safetensors"), "damaged or cut short"),
@@ -140,14 +132,8 @@ def test_a_full_disk_exits_2_says_where_and_leaves_whole_files_only(
     assert {path.name for path in left} <= {"cameras-dataset-eval.json", "run.log"}
 
 
-NO_FIGURES = [
-    '{"psnr": 1' + "0" * 400 + "}",
-    "\udcff",
-    "[" * 60 + "]" * 60,
-    '{"psnr": "high"}',
-    '{"psnr": NaN}',
-    "[]",
-]
+NO_FIGURES = ['{"psnr": 1' + "0" * 400 + "}", '{"psnr": "high"}', '{"psnr": NaN}']
+NO_FIGURES += ["\udcff", "[" * 60 + "]" * 60, "[]"]
 
 
 @pytest.mark.parametrize("found", NO_FIGURES)
@@ -157,21 +143,15 @@ def test_figures_that_no_evaluation_wrote_are_refused_by_the_report(run_copy, fo
     assert "metrics.json" in refused(export, "report", "--run", run_copy)
 
 
-BESIDE = {
-    "piped metrics": (piped("metrics.jsonl"), train, ["unmix-nerf", "--load-run"], "is no regular file"),
-    "piped log": (piped("run.log"), train, ["unmix-nerf", "--load-run"], "run.log"),
-    "camera of another size": (
-        in_scene("eval_cameras", width=32),
-        evaluate,
-        ["--run"],
-        "is not the one that",
-    ),
-}
-
-
-@pytest.mark.parametrize("spoil", BESIDE)
-def test_what_lies_beside_config_and_scene_is_read_with_the_same_care(run_copy, spoil):
-    change, command, words, said = BESIDE[spoil]
+@pytest.mark.parametrize(
+    ("change", "command", "words", "said"),
+    [
+        (piped("metrics.jsonl"), train, ["unmix-nerf", "--load-run"], "is no regular file"),
+        (piped("run.log"), train, ["unmix-nerf", "--load-run"], "run.log"),
+        (in_scene("eval_cameras", width=32), evaluate, ["--run"], "is not the one that"),
+    ],
+)
+def test_what_lies_beside_config_and_scene_is_read_with_the_same_care(run_copy, change, command, words, said):
     change(run_copy)
     assert said in refused(command, *words, run_copy)
 

@@ -24,9 +24,8 @@ def ended(work: str, folder: Path, before: str = "", **environment: str) -> subp
         f"def command(_words):\n    {work}\nrun_command(command, [])"
     )
     kept = {name: value for name, value in {**os.environ, **environment}.items() if value}
-    return subprocess.run(
-        [sys.executable, "-c", code], env=kept, cwd=folder, capture_output=True, encoding="utf-8", check=False
-    )
+    words = [sys.executable, "-c", code]
+    return subprocess.run(words, env=kept, cwd=folder, capture_output=True, encoding="utf-8", check=False)
 
 
 NO_CACHE = {"XDG_CACHE_HOME": "", "XDG_CONFIG_HOME": "", "WARP_CACHE_PATH": "", "MPLCONFIGDIR": ""}

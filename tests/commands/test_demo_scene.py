@@ -58,9 +58,6 @@ def test_raw_writes_a_capture_and_names_the_command_that_makes_a_scene_of_it(tmp
     assert all(f"  {capture / name}  " in printed for name in shown)
     words = shlex.split(printed.splitlines()[-1].partition(": ")[2])
     assert words[:6] == ["unmix-process", "cubes", "--data", str(capture), "--output-dir", "SCENE"]
-    assert words[6:] == [
-        *("--white", f"{capture}/white.hdr", "--dark", f"{capture}/dark.hdr"),
-        "--poses",
-        "estimate",
-    ]
+    references = ["--white", f"{capture}/white.hdr", "--dark", f"{capture}/dark.hdr"]
+    assert words[6:] == [*references, "--poses", "estimate"]
     assert not (capture / "transforms.json").exists()

@@ -6,22 +6,22 @@ import shutil
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from tests.commands.running import SMALL_METHOD, done, picture_size, refused, run_of
+from tests.commands.conftest import small_run
+from tests.commands.running import done, picture_size, refused
 from unmix_plugin.commands.eval import evaluate
-from unmix_plugin.commands.train import train
-from unmix_plugin.datamanager import HyperspectralDataManager
 from unmix_plugin.engine.processes import ALONE
 from unmix_plugin.engine.runs.load_run import load_pipeline
 from unmix_plugin.products.evaluation import evaluate_scene
 from unmix_plugin.products.product import Job
 from unmix_plugin.products.report.report import _aligned_in_words, _look
-from unmix_plugin.scenes.demo.scene import make_demo_scene
 from unmix_plugin.scenes.reading.loader import load_scene
+from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.metrics import psnr
 from unmix_plugin.trained.evaluation import DEFINITIONS
 from unmix_plugin.trained.open_run import load_run
@@ -54,8 +54,8 @@ def test_figures_are_means_over_the_views_of_what_the_model_renders(evaluated):
     path, _ = evaluated
     figures = metrics(path / "eval")
     loaded = load_pipeline(path, "cpu")
-    assert isinstance(loaded.pipeline.datamanager, HyperspectralDataManager)
-    scene = loaded.pipeline.datamanager.scene
+    datamanager: Any = loaded.pipeline.datamanager
+    scene = datamanager.scene
     expected = []
     for index in scene.eval_indices:
         predicted = loaded.pipeline.model.get_outputs_for_camera(scene.cameras[index])["spectral"]
@@ -112,9 +112,8 @@ def test_two_processes_find_what_one_finds(evaluated, tmp_path):
     shutil.rmtree(path / "eval")
     done(evaluate, "--run", path, "--device", "cpu", "--num-devices", 2)
     assert (path / "eval" / "metrics.json").read_bytes() == alone
-    assert {picture.name for picture in (path / "eval").glob("*/*.png")} == {
-        picture.name for picture in (evaluated[0] / "eval").glob("*/*.png")
-    }
+    pictures = [{one.name for one in (run / "eval").glob("*/*.png")} for run in (path, evaluated[0])]
+    assert pictures[0] == pictures[1]
 
 
 @pytest.fixture
@@ -164,26 +163,15 @@ def test_what_is_wrong_with_edits_or_data_exits_2_and_writes_nothing(run_copy, w
     assert not (run_copy / "exports").exists()
 
 
-def evaluated_psnr(scene: Path, output: Path) -> tuple[float, str]:
-    words = ["--data", scene, "--output-dir", output, "--max-num-iterations", 20, "--light", "per-view"]
-    ended = done(train, "unmix-nerf", *words, *SMALL_METHOD)
-    path = run_of(ended)
-    found = done(evaluate, "--run", path, "--device", "cpu")
-    return metrics(path / "eval")["psnr_matter"], found.out
-
-
-def test_the_gain_of_an_evaluation_view_does_not_count(tmp_path):
-    scene = tmp_path / "scene"
-    make_demo_scene(scene, 16, 8, 8)
-    plain, said = evaluated_psnr(scene, tmp_path / "plain")
-    assert "each evaluation view was aligned first" in said
-    content = json.loads((scene / "transforms.json").read_text())
-    names = content.get("val_filenames") or content["test_filenames"]
-    for frame in content["frames"]:
-        if frame["file_path"] in names:
-            cube = scene / frame["hyperspectral_file_path"]
-            np.save(cube, (0.5 * np.load(cube).astype(np.float32)).astype(np.float16))
-    halved, _ = evaluated_psnr(scene, tmp_path / "halved")
+def test_the_gain_of_an_evaluation_view_does_not_count(tmp_path, monkeypatch):
+    path = small_run(tmp_path, "--light", "per-view").run
+    words = ["--run", path, "--device", "cpu"]
+    assert "each evaluation view was aligned first" in done(evaluate, *words).out
+    plain = metrics(path / "eval")["psnr_matter"]
+    cube = Scene.cube
+    monkeypatch.setattr(Scene, "cube", lambda *asked: 0.5 * cube(*asked))
+    done(evaluate, *words)
+    halved = metrics(path / "eval")["psnr_matter"]
     # Half the light has half the error after alignment: 6 dB.
     assert abs(halved - plain - 6.02) < 0.5
 
@@ -193,18 +181,14 @@ def test_the_gain_of_a_view_of_a_rig_does_not_count_either_nor_in_a_report(train
     fitting = replace(loaded.materials_scene, fitted=("gain",))
     rig = replace(measured, sensors=measured.sensors * 2)
     assert rig.is_rig
-    plain, seen = (
-        evaluate_scene(fitting, scene, None, tmp_path, lambda _, items: iter(items), ALONE)
-        for scene in (measured, rig)
-    )
-    assert seen is not None
-    assert plain is not None
+    show = lambda _, items: iter(items)  # noqa: E731
+    found: Any = [evaluate_scene(fitting, one, None, tmp_path, show, ALONE) for one in (measured, rig)]
+    plain, seen = found
     assert seen.more["aligned"] == ["gain"]
     assert seen.figures["psnr"] == pytest.approx(plain.figures["psnr"])
-    quiet = (lambda _: None, lambda _: nullcontext(), lambda _, items: iter(items))
+    quiet = (lambda _: None, lambda _: nullcontext(), show)
     job = Job(replace(loaded, scene=fitting), tmp_path, False, *quiet, ALONE)
-    views = _look(job, job.views("eval"), measured)
-    assert views.evaluation is not None
+    views: Any = _look(job, job.views("eval"), measured)
     assert views.evaluation.figures() == pytest.approx(plain.figures)
     assert "exposure" in _aligned_in_words(job)
 

@@ -30,23 +30,18 @@ def rendered(loaded, index, *names):
 def test_by_default_every_evaluation_view_is_written_in_what_suits_each_output(trained, tmp_path):
     ended = done(render, "--run", trained.run, "--output", tmp_path, "--device", "cpu")
     views = ("eval_002", "eval_006")
-    assert files(tmp_path) == sorted(
-        [
-            *(f"spectral/{view}.{suffix}" for view in views for suffix in ("hdr", "img")),
-            *(f"abundances/{view}.{suffix}" for view in views for suffix in ("hdr", "img", "png")),
-            *(f"depth/{view}.{suffix}" for view in views for suffix in ("npy", "png")),
-            *(f"{name}/{view}.png" for view in views for name in ("rgb", "segmentation")),
-            *(f"{name}_legend.png" for name in ("abundances", "depth", "segmentation")),
-            "cameras-dataset-eval.json",
-        ]
-    )
+    formats = {"spectral": ["hdr", "img"], "abundances": ["hdr", "img", "png"], "depth": ["npy", "png"]}
+    formats |= {"rgb": ["png"], "segmentation": ["png"]}
+    expected = [f"{name}/{view}.{end}" for name, ends in formats.items() for end in ends for view in views]
+    expected += [f"{name}_legend.png" for name in ("abundances", "depth", "segmentation")]
+    assert files(tmp_path) == sorted([*expected, "cameras-dataset-eval.json"])
     loaded = load_run(trained.run, "cpu")
     for index, view in enumerate(views):
         spectra, shares, depth = rendered(loaded, index, "spectral", "abundances", "depth")
         np.testing.assert_array_equal(read_envi(tmp_path / "spectral" / view)[0], spectra)
         np.testing.assert_array_equal(read_envi(tmp_path / "abundances" / view)[0], shares)
         np.testing.assert_array_equal(np.load(tmp_path / "depth" / f"{view}.npy"), depth)
-    for name in ("spectral", "abundances", "depth", "rgb", "segmentation", "cameras-dataset-eval.json"):
+    for name in (*formats, "cameras-dataset-eval.json"):
         assert str(tmp_path / name) in ended.out
 
 
@@ -144,18 +139,13 @@ def test_files_of_an_earlier_render_are_kept_unless_overwrite_is_given(trained, 
     ("words", "said"),
     [
         (["--outputs", "spectrl"], "no output named 'spectrl' (did you mean spectral"),
-        (["--formats", "tiff"], "there is no format 'tiff'"),
-        (["--cameras", "orbits"], "unknown cameras 'orbits' (did you mean orbit?)"),
         (["--size", "64x99999"], "--size: 64 x 99999 pixels"),
         (["--illuminant", "sun"], "sun"),
         (["--edits", "none.yml"], "none.yml"),
     ],
 )
-def test_what_cannot_be_rendered_exits_2_before_anything_is_written(trained, tmp_path, words, said):
-    ended = run(render, "--run", trained.run, "--output", tmp_path / "out", *words)
-    assert ended.status == 2
-    assert said in ended.err
-    assert len(ended.err.strip().splitlines()) <= 2
+def test_what_cannot_be_rendered_is_refused_before_anything_is_written(trained, tmp_path, words, said):
+    assert said in refused(render, "--run", trained.run, "--output", tmp_path / "out", *words)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -168,6 +158,5 @@ def test_a_size_that_is_none_is_refused_before_processes_start_and_the_run_is_re
 def test_a_folder_that_cannot_be_made_exits_2_before_rendering(trained, tmp_path):
     (tmp_path / "file").write_text("in the way")
     ended = run(render, "--run", trained.run, "--output", tmp_path / "file" / "here")
-    assert ended.status == 2
+    assert (ended.status, "rendering" in ended.out) == (2, False)
     assert str(tmp_path / "file" / "here") in ended.err
-    assert "rendering" not in ended.out

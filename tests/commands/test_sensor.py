@@ -11,7 +11,7 @@ from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.sensor import read_sensor
 from unmix_plugin.trained.open_run import load_run
 
-pytestmark = pytest.mark.usefixtures("no_wait_for_the_disk")
+pytestmark = pytest.mark.usefixtures("no_wait_for_the_disk", "coarse_surfaces")
 
 RESPONSES = """wavelength,red,green,blue,nir
 430,0,0,1,0
@@ -66,9 +66,8 @@ def test_known_spectra_are_not_compared_with_broad_channels(solid, camera, tmp_p
     assert "without angles.csv: known spectra are compared in the run's own bands" in said
     assert not (tmp_path / "out" / "angles.csv").exists()
     done(export, "endmembers", "--run", solid.run, "--output", tmp_path / "all")
-    whole, seen = (
-        np.loadtxt(tmp_path / name / "endmembers.csv", delimiter=",", skiprows=1) for name in ("all", "out")
-    )
+    tables = (tmp_path / name / "endmembers.csv" for name in ("all", "out"))
+    whole, seen = (np.loadtxt(table, delimiter=",", skiprows=1) for table in tables)
     expected = seen_by(camera, solid)
     np.testing.assert_allclose(seen[:, 0], expected.bands.centers_nm)
     np.testing.assert_allclose(seen[:, 1:], expected.matrix.T @ whole[:, 1:], atol=1e-5)

@@ -7,6 +7,7 @@ import sys
 from dataclasses import replace
 from importlib.metadata import EntryPoint
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,8 +21,6 @@ from unmix_plugin.engine import registry
 from unmix_plugin.engine.runs.load_run import load_config, load_model
 from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.model import UnmixModel
-from unmix_plugin.settings import HyperspectralDataManagerConfig, UnmixModelConfig
 from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
 
 
@@ -44,23 +43,18 @@ def test_a_run_holds_its_settings_its_scene_a_checkpoint_and_its_endmembers(trai
     assert json.loads((trained.run / "training.json").read_text())["steps"] == 20
     assert (trained.run / "checkpoints" / "step-000020.safetensors").is_file()
     table = read_spectra_csv(trained.run / "endmembers.csv")
-    model = load_model(trained.run, "cpu").model
-    assert isinstance(model, UnmixModel)
+    model: Any = load_model(trained.run, "cpu").model
     assert table.names == tuple(f"endmember_{index}" for index in range(6))
     np.testing.assert_allclose(table.spectra, model.endmembers.detach().numpy(), rtol=1e-6)
     np.testing.assert_allclose(table.bands.centers_nm, model.metadata["wavelengths_nm"], rtol=1e-8)
 
 
 def test_words_work_right_after_the_method_and_common_settings_have_short_names(tmp_path):
-    argv = f"unmix-nerf --data {tmp_path} --output-dir out --max-num-iterations 5 --max-seconds 7.5 --seed 3 "
-    argv += (
-        f"--device cpu --endmembers 4 --endmember-init file --endmember-file {tmp_path} --value-scale 4095 "
-    )
-    config, _ = parse(f"{argv}--invalid-pixels mask".split())
+    argv = f"unmix-nerf --data {tmp_path} --output-dir out --max-num-iterations 5 --max-seconds 7.5 --seed 3"
+    argv += f" --endmembers 4 --endmember-init file --endmember-file {tmp_path} --value-scale 4095"
+    config: Any = parse(f"{argv} --device cpu --invalid-pixels mask".split())[0]
     assert (config.data, config.output_dir, config.seed, config.device) == (tmp_path, Path("out"), 3, "cpu")
     assert (config.max_num_iterations, config.max_seconds) == (5, 7.5)
-    assert isinstance(config.pipeline.model, UnmixModelConfig)
-    assert isinstance(config.pipeline.datamanager, HyperspectralDataManagerConfig)
     model, scene = config.pipeline.model, config.pipeline.datamanager.scene
     assert (model.num_endmembers, model.endmember_init, model.endmember_file) == (4, "file", tmp_path)
     assert (scene.value_scale, scene.invalid_pixels) == (4095.0, "mask")
@@ -98,15 +92,11 @@ def test_a_limit_given_alone_is_the_only_limit(words, iterations, seconds):
         (["unmix-nerf", "--data", "demo", "--seed", "pi"], "seed"),
         (["unmix-nerf", "--data", "demo", "--max-seconds", "-1"], "max-seconds above 0"),
         (["unmix-nerf", "--data", "demo", "--pipeline.model.num-endmembers", "0"], "num-endmembers"),
-        (["unmix-nerf", "--load-run", "no-such-run"], "no run folder at no-such-run"),
     ],
 )
 def test_a_bad_word_exits_2_with_its_cause_and_writes_nothing(monkeypatch, tmp_path, words, said):
     monkeypatch.chdir(tmp_path)
-    ended = run(train, *words)
-    assert ended.status == 2
-    assert said in ended.err
-    assert "Traceback" not in ended.err
+    assert said in refused(train, *words)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -155,11 +145,9 @@ def test_training_into_a_pipe_that_closes_saves_and_exits_141(trained, tmp_path)
         "ProgressDisplay.__init__.__defaults__ = (0.2, 0.2)  # seconds between lines\n"
         "from unmix_plugin.commands import scripts\nscripts.train()"
     )
-    with subprocess.Popen(
-        [sys.executable, "-c", code, *argv], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
-        assert process.stdout is not None
-        assert process.stderr is not None
+    words = [sys.executable, "-c", code, *argv]
+    process: Any
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         for _ in range(2):
             process.stdout.readline()
         process.stdout.close()
@@ -227,16 +215,13 @@ def test_a_full_disk_while_saving_exits_2_and_says_so(trained, tmp_path, monkeyp
 
     step = Trainer._train_step
     monkeypatch.setattr(Trainer, "_train_step", full_from_the_first_step)
-    assert "No space left on device" in refused(
-        train, *small_training(trained, tmp_path / "out", "--max-num-iterations", 2)
-    )
+    words = small_training(trained, tmp_path / "out", "--max-num-iterations", 2)
+    assert "No space left on device" in refused(train, *words)
     assert not list(tmp_path.rglob("*.tmp"))
     assert not list(tmp_path.rglob("step-*"))
 
 
-def test_training_from_python_takes_the_names_of_the_flags_and_gives_the_scene_of_its_run(
-    trained, tmp_path, capsys
-):
+def test_training_from_python_takes_the_names_of_flags_and_gives_a_scene(trained, tmp_path, capsys):
     small = {name.lstrip("-"): value for name, value in (word.split("=") for word in SMALL_METHOD)}
     numbers = {name: json.loads(value) for name, value in small.items() if name != "device"}
     given = {"endmembers": 3, "max_num_iterations": np.int64(5), "device": "cpu", **numbers}
@@ -244,12 +229,9 @@ def test_training_from_python_takes_the_names_of_the_flags_and_gives_the_scene_o
     assert isinstance(scene, unmix_plugin.TrainedScene)
     path = Path(capsys.readouterr().out.splitlines()[-1].removeprefix("run: "))
     words = [f"--{name}={value}" for name, value in given.items()]
+    words = ["unmix-nerf", "--data", str(trained.scene), "--output-dir", str(tmp_path), *words]
     config = load_config(path)
-    assert config == replace(
-        parse(["unmix-nerf", "--data", str(trained.scene), "--output-dir", str(tmp_path), *words])[0],
-        load_run=path,
-        pipeline=config.pipeline,
-    )
+    assert config == replace(parse(words)[0], load_run=path, pipeline=config.pipeline)
     assert len(scene.materials.names) == 3
     again = unmix_plugin.train(None, load_run=path, max_num_iterations=6)
     assert isinstance(again, unmix_plugin.TrainedScene)
@@ -281,15 +263,8 @@ def test_training_from_python_refuses_a_setting_in_one_message(monkeypatch, tmp_
 
 def remarks_on(folder, *quarters: float | None, kept=slice(None), **last) -> list[str]:
     """On five lines a quarter of a training, around a loss each, one batch far off."""
-    lines = [
-        {
-            "step": 50 * (5 * quarter + row + 1),
-            "loss": loss and loss * (10 if row == 2 else 1),
-            "split": "train",
-        }
-        for quarter, loss in enumerate(quarters)
-        for row in range(5)
-    ]
+    losses = [loss and loss * (10 if row == 2 else 1) for loss in quarters for row in range(5)]
+    lines = [{"step": 50 * n, "loss": loss, "split": "train"} for n, loss in enumerate(losses, start=1)]
     lines = [*lines[:-1], {**lines[-1], **last}][kept]
     lines += [{"step": 1000, "split": "eval_all", "psnr": 20.0}]
     (folder / "metrics.jsonl").write_text("\n".join(json.dumps(line) for line in lines) + "\n")

@@ -19,7 +19,7 @@ from unmix_plugin.viewer.rendering.painting import LAYERS
 
 pytestmark = NEEDS_BROWSER
 
-WIDTH, HEIGHT, PANEL = 1000, 700, 400
+WIDTH, HEIGHT, PANEL = 1000, 420, 400
 WAIT_MS = 60_000
 LEAST_SPREAD = 4.0
 """Standard deviation of 8-bit values under which a picture counts as blank."""

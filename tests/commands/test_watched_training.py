@@ -20,10 +20,8 @@ from unmix_plugin.viewer import server
 
 
 def training_argv(trained, folder, *words):
-    return [
-        *("unmix-nerf", "--data", trained.scene, "--output-dir", folder, *SMALL_METHOD),
-        *("--viewer.enabled", "--viewer.port", "0", *words),
-    ]
+    given = ["unmix-nerf", "--data", trained.scene, "--output-dir", folder, *SMALL_METHOD]
+    return [*given, "--viewer.enabled", "--viewer.port", "0", *words]
 
 
 @needs_posix
@@ -50,9 +48,7 @@ def test_without_keep_open_the_process_ends_with_the_training(trained, tmp_path)
     assert not [thread for thread in threading.enumerate() if "viewer" in thread.name]
 
 
-def test_the_viewer_stays_as_long_as_a_page_is_open_and_the_run_is_printed_last(
-    trained, tmp_path, monkeypatch
-):
+def test_the_viewer_stays_while_a_page_is_open_and_the_run_is_printed_last(trained, tmp_path, monkeypatch):
     monkeypatch.setattr(server, "_UNWATCHED_S", 1)
     loop, is_page_open = Trainer._loop, threading.Event()
 
@@ -112,8 +108,9 @@ def test_words_of_the_viewer_are_no_settings_of_the_training(trained):
 
 
 def test_impossible_words_of_the_viewer_end_before_training(trained, tmp_path):
-    for words, said in (
-        (("--viewer.share", "2"), "--viewer.share is a part"),
-        (("--viewer.host", "203.0.113.7"), "can't listen"),
+    for word, value, said in (
+        ("share", 2, "--viewer.share is a part"),
+        ("host", "203.0.113.7", "can't listen"),
     ):
-        assert said in refused(train, *training_argv(trained, tmp_path / "out", *words))
+        words = training_argv(trained, tmp_path / "out", f"--viewer.{word}", value)
+        assert said in refused(train, *words)

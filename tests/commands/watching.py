@@ -24,13 +24,9 @@ class Started:
             "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
             f"from unmix_plugin.commands import scripts; scripts.{command}()"
         )
-        self.process = subprocess.Popen(
-            [sys.executable, "-c", launch, *map(str, words)],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
+        argv = [sys.executable, "-c", launch, *map(str, words)]
+        none, pipe, joined = subprocess.DEVNULL, subprocess.PIPE, subprocess.STDOUT
+        self.process = subprocess.Popen(argv, stdin=none, stdout=pipe, stderr=joined, text=True)
         self.lines = []
         self._changed = threading.Condition()
         self._has_ended = False

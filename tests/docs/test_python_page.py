@@ -70,13 +70,8 @@ def test_the_page_lists_every_output_and_each_has_the_shape_that_it_says():
     shapes = {name: shape.strip() for named, shape in rows for name in re.findall(r"`([^`]+)`", named)}
     assert {name for name in shapes if ":" not in name} == {output.name for output in scene.outputs}
     camera = scene.views[-1].camera
-    length = {
-        "H": camera.height,
-        "W": camera.width,
-        "B": len(scene.bands),
-        "K": len(scene.materials.names),
-        "3": 3,
-    }
+    length = {"H": camera.height, "W": camera.width, "3": 3}
+    length |= {"B": len(scene.bands), "K": len(scene.materials.names)}
     view = scene.look(camera)
     elsewhere = {"target:paint.csv", "library:mine.csv", "index:ndvi", "false-colour:860,650,550"}
     for name in set(shapes) - elsewhere:

@@ -39,13 +39,9 @@ def words_of(page: Path) -> str:
 def test_it_builds_and_has_every_command_and_every_public_name(tmp_path):
     pytest.importorskip("furo")
     pytest.importorskip("myst_nb")
-    built = subprocess.run(
-        [str(ROOT / "scripts/build_site.sh"), str(tmp_path / "html")],
-        env={**os.environ, "PYTHON": sys.executable},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    words = [str(ROOT / "scripts/build_site.sh"), str(tmp_path / "html")]
+    with_python = {**os.environ, "PYTHON": sys.executable}
+    built = subprocess.run(words, env=with_python, capture_output=True, text=True, check=False)
     assert built.returncode == 0, built.stderr + built.stdout
     commands = tmp_path / "html/reference/commands"
     assert "--max-seconds FLOAT" in words_of(commands / "unmix-train.html")

@@ -1,7 +1,7 @@
 """What the engine's tests share: the second method, registered, short configs of it, and a run."""
 
-import importlib.metadata
 from dataclasses import replace
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from shutil import copytree
 
@@ -13,13 +13,11 @@ from unmix_plugin.engine.configs import TrainerConfig
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.engine.training.trainer import Trainer
 
-RGB_NERF_ENTRY = importlib.metadata.EntryPoint(
-    "rgb-nerf", "tests.engine.rgb_nerf_plugin:rgb_nerf", registry.METHOD_GROUP
-)
+RGB_NERF_ENTRY = EntryPoint("rgb-nerf", "tests.engine.rgb_nerf_plugin:rgb_nerf", registry.METHOD_GROUP)
 
 
 @pytest.fixture
-def registered(monkeypatch: pytest.MonkeyPatch):
+def registered(monkeypatch):
     """Entry points found in place of the installed ones; a test may append to the list."""
     entries = [RGB_NERF_ENTRY]
     monkeypatch.setattr(registry, "entry_points", lambda group: [e for e in entries if e.group == group])
@@ -27,7 +25,7 @@ def registered(monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.fixture
-def short_config(tmp_path: Path, registered: list) -> TrainerConfig:  # noqa: ARG001
+def short_config(tmp_path, registered):  # noqa: ARG001
     """Twelve steps of the second method."""
     return short_training(tmp_path)
 
@@ -40,7 +38,7 @@ def short_training(folder: Path) -> TrainerConfig:
 
 
 @pytest.fixture(scope="session")
-def trained_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def trained_once(tmp_path_factory):
     """A finished run that nobody changes."""
     trainer = Trainer(short_training(tmp_path_factory.mktemp("trained")))
     trainer.train()
@@ -48,6 +46,6 @@ def trained_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def trained(short_config: TrainerConfig, trained_once: Path) -> RunFolder:
+def trained(short_config, trained_once):
     """A finished run of its own for each test."""
     return RunFolder(copytree(trained_once, short_config.output_dir / "run"))

@@ -87,7 +87,7 @@ def interrupt_in(number: int) -> None:
 
 
 def name_threads(path: Path) -> None:
-    """Write the names of this process's threads, where the system tells them."""
+    """Of this process, where the system tells them."""
     path.write_text("".join(thread.read_text() for thread in Path("/proc/self/task").glob("*/comm")))
 
 

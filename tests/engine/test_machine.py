@@ -10,7 +10,7 @@ from unmix_plugin.engine.machine import resolve_device, seed_everything, step_ge
 from unmix_plugin.errors import ConfigError
 
 
-def test_auto_is_cuda_where_there_is_one_and_the_cpu_elsewhere(monkeypatch: pytest.MonkeyPatch):
+def test_auto_is_cuda_where_there_is_one_and_the_cpu_elsewhere(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert resolve_device("auto") == resolve_device("cpu") == torch.device("cpu")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
@@ -20,7 +20,7 @@ def test_auto_is_cuda_where_there_is_one_and_the_cpu_elsewhere(monkeypatch: pyte
 
 
 @pytest.mark.parametrize(("built_for", "advice"), [(None, "install a CUDA build"), ("12.8", "nvidia-smi")])
-def test_cuda_without_cuda_is_refused_with_what_to_do(monkeypatch, built_for: str | None, advice: str):
+def test_cuda_without_cuda_is_refused_with_what_to_do(monkeypatch, built_for, advice):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(torch.version, "cuda", built_for)
     with pytest.raises(ConfigError, match=f"--device cuda, but .*{advice}.*leave --device at auto"):
@@ -39,7 +39,7 @@ def test_neighbouring_seeds_steps_and_streams_are_all_different_and_each_draws_w
 
 
 def test_seeding_everything_repeats_torch_numpy_and_python():
-    def draw() -> tuple[float, float, float]:
+    def draw():
         seed_everything(5)
         return float(torch.rand(())), float(np.random.rand()), random.random()  # noqa: NPY002
 

@@ -1,29 +1,27 @@
 """What a pipeline computes from a model and a data manager, whatever they are."""
 
 import random
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from tests.engine.rgb_nerf_plugin import RgbNerf
 from tests.engine.stopped_runs import finished, quiet_trainer
-from unmix_plugin.engine.configs import TrainerConfig
 from unmix_plugin.engine.model import TrainingCallback, TrainingCallbackLocation
-from unmix_plugin.engine.pipeline import Pipeline
 from unmix_plugin.engine.runs.load_run import load_pipeline
 from unmix_plugin.errors import ConfigError
 
 
 @pytest.fixture
-def pipeline(short_config: TrainerConfig) -> Pipeline:
+def pipeline(short_config):
     torch.manual_seed(0)
     made = short_config.pipeline.setup(data=short_config.data, device=torch.device("cpu"), seed=3)
     made.initialise()
     return made
 
 
-def test_a_whole_image_is_its_rays_rendered_in_any_chunks(pipeline: Pipeline):
+def test_a_whole_image_is_its_rays_rendered_in_any_chunks(pipeline):
     camera = pipeline.datamanager.eval_cameras[0]
     model = pipeline.model.eval()
     at_once = model.get_outputs(camera.image_rays(0))
@@ -36,9 +34,7 @@ def test_a_whole_image_is_its_rays_rendered_in_any_chunks(pipeline: Pipeline):
         model.get_outputs_for_camera(camera, ["depht"])
 
 
-def test_average_metrics_are_the_mean_over_the_evaluation_views_that_have_them(
-    pipeline: Pipeline, monkeypatch
-):
+def test_average_metrics_are_the_mean_over_the_evaluation_views_that_have_them(pipeline, monkeypatch):
     seen: list[bool] = []
 
     def metrics(outputs, _):
@@ -54,15 +50,15 @@ def test_average_metrics_are_the_mean_over_the_evaluation_views_that_have_them(
     assert pipeline.model.training
 
 
-def test_what_a_step_draws_follows_from_the_seed_and_the_step_alone(pipeline: Pipeline):
-    def loss(step: int) -> float:
+def test_what_a_step_draws_follows_from_the_seed_and_the_step_alone(pipeline):
+    def loss(step):
         pipeline.seed_step(step)
         torch.rand(3)  # somebody else draws from the global generator
         return pipeline.get_train_loss_dict(5)[1]["rgb_loss"].item()
 
     assert loss(5) == loss(5) != loss(6)
 
-    def globally(step: int) -> tuple[float, float]:
+    def globally(step):
         pipeline.seed_step(step)
         return np.random.rand(), random.random()  # noqa: NPY002 - a method's own code may draw from them
 
@@ -70,9 +66,7 @@ def test_what_a_step_draws_follows_from_the_seed_and_the_step_alone(pipeline: Pi
     assert not set(globally(5)) & set(globally(6))
 
 
-def test_training_calls_the_callbacks_of_every_step_in_order_with_rising_progress(
-    short_config: TrainerConfig,
-):
+def test_training_calls_the_callbacks_of_every_step_in_order_with_its_progress(short_config):
     trainer = quiet_trainer(short_config)
     seen: list[tuple[str, int, float]] = []
     before, after = TrainingCallbackLocation
@@ -83,15 +77,11 @@ def test_training_calls_the_callbacks_of_every_step_in_order_with_rising_progres
     assert seen == [(name, step, step / 12) for step in range(12) for name in "abc"]
 
 
-def test_a_model_takes_its_first_values_from_the_scene_only_when_a_run_starts(
-    short_config: TrainerConfig, monkeypatch: pytest.MonkeyPatch
-):
-    from tests.engine.rgb_nerf_plugin import RgbNerf
-
-    calls: list[set[str]] = []
+def test_a_model_takes_its_first_values_from_the_scene_only_when_a_run_starts(short_config, monkeypatch):
+    calls = []
     original = RgbNerf.initialise
 
-    def counted(self: RgbNerf, initial_data, generator) -> None:
+    def counted(self, initial_data, generator):
         calls.append(set(initial_data))
         original(self, initial_data, generator)
 
@@ -101,9 +91,8 @@ def test_a_model_takes_its_first_values_from_the_scene_only_when_a_run_starts(
     assert calls == [{"raw_density"}]
 
 
-def test_a_pipeline_loads_with_its_scene_at_another_place(short_config: TrainerConfig, tmp_path: Path):
+def test_a_pipeline_loads_with_its_scene_at_another_place(short_config, tmp_path):
     trainer = finished(short_config)
-    assert short_config.data is not None
     moved = short_config.data.rename(tmp_path / "moved")
     loaded = load_pipeline(trainer.run.path, "cpu", data=moved)
     assert loaded.config.data == loaded.pipeline.datamanager.data == moved
@@ -111,9 +100,7 @@ def test_a_pipeline_loads_with_its_scene_at_another_place(short_config: TrainerC
     assert not loaded.pipeline.model.training
 
 
-def test_warnings_of_the_data_are_told_when_a_run_starts_and_not_when_one_is_loaded(
-    short_config: TrainerConfig, monkeypatch
-):
+def test_warnings_of_the_data_are_told_only_when_a_run_starts(short_config, monkeypatch):
     made = short_config.pipeline.setup(data=short_config.data, device=torch.device("cpu"), seed=3)
     monkeypatch.setattr(made.datamanager, "warnings", lambda: ["the poses look odd"])
     assert "odd" not in made.reasons

@@ -1,7 +1,6 @@
 """What several processes that train one model owe each other; what keeps them from it is said once, by the first."""
 
 import json
-from pathlib import Path
 
 import pytest
 import torch
@@ -15,7 +14,7 @@ from unmix_plugin.errors import ConfigError
 
 
 @pytest.fixture
-def second_of_two(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
+def second_of_two(monkeypatch):
     """The environment of the second process of two on one machine that has two GPUs."""
     for name, value in {"RANK": 1, "WORLD_SIZE": 2, "LOCAL_RANK": 1, "LOCAL_WORLD_SIZE": 2}.items():
         monkeypatch.setenv(name, str(value))
@@ -55,13 +54,13 @@ MODULE = "tests.engine.process_worker"
 
 
 @pytest.fixture
-def run(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
+def run(tmp_path, capfd):
     """Runs an action in two processes: exit code, standard error and what each process kept.
 
     None may leave threads of the group behind, which can abort a process when Python ends.
     """
 
-    def run_action(action: str) -> tuple[int, str, list[dict[str, torch.Tensor]]]:
+    def run_action(action):
         code = _run_processes(MODULE, [str(tmp_path), action], 2)
         kept = [torch.load(path) for path in sorted(tmp_path.glob("rank-*.pt"))]
         left = [path.read_text() for path in tmp_path.glob("threads-*.txt")]
@@ -72,7 +71,7 @@ def run(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
     return run_action
 
 
-def test_the_gradient_of_a_batch_is_that_of_one_process(run, tmp_path: Path):
+def test_the_gradient_of_a_batch_is_that_of_one_process(run, tmp_path):
     code, errors, (first, second) = run("gradients")
     assert code == 0, errors
     _, steps = prepare_steps(config_for(tmp_path))
@@ -89,7 +88,7 @@ def test_the_gradient_of_a_batch_is_that_of_one_process(run, tmp_path: Path):
 
 
 @pytest.mark.slow
-def test_two_processes_go_on_where_one_stopped_and_end_with_the_same_model(run, tmp_path: Path):
+def test_two_processes_go_on_where_one_stopped_and_end_with_the_same_model(run, tmp_path):
     Trainer(config_for(tmp_path)).train()
     (training,) = (tmp_path / "outputs").glob("*/*/*/training.json")
     assert json.loads(training.read_text())["steps"] == STEPS
@@ -108,7 +107,7 @@ def test_two_processes_go_on_where_one_stopped_and_end_with_the_same_model(run, 
         ("die", "can't reach the others, one of which has ended; what was saved before is whole"),
     ],
 )
-def test_a_failure_anywhere_ends_all_with_one_message(run, action: str, message: str):
+def test_a_failure_anywhere_ends_all_with_one_message(run, action, message):
     code, errors, kept = run(action)
     assert (code, kept) == (2, [])
     lines = [line for line in errors.splitlines() if line.startswith(("error:", "this is a bug"))]
@@ -117,14 +116,14 @@ def test_a_failure_anywhere_ends_all_with_one_message(run, action: str, message:
 
 
 @pytest.mark.slow
-def test_ctrl_c_reaches_all_processes_and_what_was_learned_is_saved(run, tmp_path: Path):
+def test_ctrl_c_reaches_all_processes_and_what_was_learned_is_saved(run, tmp_path):
     code, errors, _ = run("interrupted")
     assert code != 2, errors
     assert "can't reach the others" not in errors
     assert list((tmp_path / "outputs").glob(f"*/*/*/checkpoints/step-{STEPS // 2 + 1:06d}.safetensors"))
 
 
-def test_more_processes_than_rays_are_refused(tmp_path: Path):
+def test_more_processes_than_rays_are_refused(tmp_path):
     _, steps = prepare_steps(config_for(tmp_path))
     steps.processes = Processes(0, 4)
     with pytest.raises(ConfigError, match="4 processes for 3 rays a step; use fewer processes"):

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from importlib.metadata import EntryPoint
-from pathlib import Path
 
 import pytest
 
@@ -15,9 +14,7 @@ def entry(name: str, value: str) -> EntryPoint:
     return EntryPoint(name, value, METHOD_GROUP)
 
 
-def test_a_registered_method_is_found_under_its_configs_name_and_another_of_that_name_is_skipped(
-    registered: list[EntryPoint],
-):
+def test_a_method_is_found_under_its_configs_name_and_another_of_that_name_is_skipped(registered):
     registered[0] = entry("another-name", registered[0].value)
     registered.append(entry("z-again", registered[0].value))
     methods, broken = discover_methods()
@@ -41,11 +38,10 @@ def test_settings_have_the_name_of_the_method_by_which_their_runs_are_found_agai
     ],
 )
 def test_a_broken_plugin_is_named_with_its_reason_and_skipped(
-    registered: list[EntryPoint], value: str, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    registered, value, reason, tmp_path, monkeypatch
 ):
-    (tmp_path / "plugin_that_fails.py").write_text(
-        'raise RuntimeError("this plugin fails on import\\nbadly")'
-    )
+    code = 'raise RuntimeError("this plugin fails on import\\nbadly")'
+    (tmp_path / "plugin_that_fails.py").write_text(code)
     monkeypatch.syspath_prepend(tmp_path)
     registered.append(entry("broken-one", value))
     methods, broken = discover_methods()
@@ -56,9 +52,7 @@ def test_a_broken_plugin_is_named_with_its_reason_and_skipped(
     assert "\n" not in str(broken[0])
 
 
-def test_an_unknown_method_is_answered_with_the_nearest_names_the_list_and_what_was_skipped(
-    registered: list[EntryPoint],
-):
+def test_an_unknown_method_is_answered_with_near_names_the_list_and_what_was_skipped(registered):
     registered.append(entry("broken-one", "no_such_module_at_all:method"))
     with pytest.raises(ConfigError) as caught:
         find_method("rgb-nurf")

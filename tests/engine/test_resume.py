@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 import torch
 
+from tests.engine.rgb_nerf_plugin import BallDataManager
 from tests.engine.stopped_runs import call_after_step, finished, newest, quiet_trainer, stop_at
 from tests.systems import SIGNALS_TO_END, needs_posix
-from unmix_plugin.engine.configs import TrainerConfig
 from unmix_plugin.engine.runs.load_run import load_config
 from unmix_plugin.engine.runs.run_folder import RunLock, checkpoint_steps
 from unmix_plugin.engine.training.training_control import Interrupted
@@ -33,9 +33,7 @@ def train_lines(run: Path) -> list[dict]:
 @pytest.mark.parametrize(
     ("number", "average_decay"), [(signal.SIGINT, None), *((number, 0.9) for number in SIGNALS_TO_END)]
 )
-def test_stopped_and_resumed_equals_straight_to_the_bit(
-    short_config: TrainerConfig, number: int, average_decay: float | None
-):
+def test_stopped_and_resumed_equals_straight_to_the_bit(short_config, number, average_decay):
     config = replace(short_config, average_decay=average_decay)
     straight = finished(config)
     stopped = stop_at(config, 6, number)
@@ -59,11 +57,11 @@ def test_stopped_and_resumed_equals_straight_to_the_bit(
     assert train_lines(resumed.run.path) == train_lines(straight.run.path)
 
 
-def test_a_killed_run_goes_on_from_its_last_checkpoint_and_forgets_later_metrics(short_config: TrainerConfig):
+def test_a_killed_run_goes_on_from_its_last_checkpoint_and_forgets_later_metrics(short_config):
     class Killed(BaseException):
         pass
 
-    def kill() -> None:
+    def kill():
         raise Killed
 
     trainer = quiet_trainer(short_config)
@@ -79,7 +77,7 @@ def test_a_killed_run_goes_on_from_its_last_checkpoint_and_forgets_later_metrics
     assert [line["step"] for line in train_lines(trainer.run.path)] == list(range(1, 13))
 
 
-def test_a_finished_run_resumed_is_left_as_it_is_and_goes_on_to_a_longer_limit(short_config: TrainerConfig):
+def test_a_finished_run_resumed_is_left_as_it_is_and_goes_on_to_a_longer_limit(short_config):
     first = finished(short_config)
     before = newest(first.run.path)
     record = quiet_trainer(load_config(first.run.path)).train()
@@ -91,9 +89,7 @@ def test_a_finished_run_resumed_is_left_as_it_is_and_goes_on_to_a_longer_limit(s
 
 
 @pytest.mark.parametrize(("step", "saved", "said"), [(6, 4, None), (2, None, "no checkpoint")])
-def test_a_second_ctrl_c_stops_within_the_step_and_names_the_last_checkpoint(
-    short_config: TrainerConfig, step: int, saved: int | None, said: str | None
-):
+def test_a_second_ctrl_c_stops_within_the_step_and_names_the_last_checkpoint(short_config, step, saved, said):
     trainer = quiet_trainer(short_config)
     call_after_step(trainer, step, press_ctrl_c_twice)
     with pytest.raises(Interrupted, match=said) as caught:
@@ -104,8 +100,8 @@ def test_a_second_ctrl_c_stops_within_the_step_and_names_the_last_checkpoint(
 
 
 @needs_posix
-def test_a_lost_terminal_may_say_so_twice_and_under_nohup_changes_nothing(short_config: TrainerConfig):
-    def hang_up_twice() -> None:
+def test_a_lost_terminal_may_say_so_twice_and_under_nohup_changes_nothing(short_config):
+    def hang_up_twice():
         for _ in range(2):
             signal.raise_signal(signal.SIGHUP)
 
@@ -128,15 +124,11 @@ lock = RunLock(Path(sys.argv[1]))
 """
 
 
-def test_a_run_is_trained_by_one_process_at_a_time(short_config: TrainerConfig):
+def test_a_run_is_trained_by_one_process_at_a_time(short_config):
     run = stop_at(short_config, 6).run
     before = (run / "metrics.jsonl").read_bytes()
-    words = [
-        sys.executable,
-        "-c",
-        TAKING + "print('held', flush=True); sys.stdin.read()",
-        str(run / "run.lock"),
-    ]
+    code = TAKING + "print('held', flush=True); sys.stdin.read()"
+    words = [sys.executable, "-c", code, str(run / "run.lock")]
     with subprocess.Popen(words, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
         assert other.stdout is not None
         assert other.stdout.readline() == "held\n"
@@ -147,7 +139,7 @@ def test_a_run_is_trained_by_one_process_at_a_time(short_config: TrainerConfig):
     assert quiet_trainer(load_config(run)).train().steps == 12
 
 
-def test_a_lock_that_is_let_go_twice_leaves_that_of_another_holder(tmp_path: Path):
+def test_a_lock_that_is_let_go_twice_leaves_that_of_another_holder(tmp_path):
     first, second = RunLock(tmp_path / "lock"), RunLock(tmp_path / "lock")
     first.release()
     first.release()
@@ -158,10 +150,8 @@ def test_a_lock_that_is_let_go_twice_leaves_that_of_another_holder(tmp_path: Pat
     assert subprocess.run(words, capture_output=True, check=False).returncode == 0
 
 
-def test_resuming_on_another_scene_is_refused(short_config: TrainerConfig, monkeypatch: pytest.MonkeyPatch):
+def test_resuming_on_another_scene_is_refused(short_config, monkeypatch):
     stopped = stop_at(short_config, 5)
-    monkeypatch.setattr(
-        "tests.engine.rgb_nerf_plugin.BallDataManager.metadata", lambda _: {"grid_size": 20, "bands": 3}
-    )
+    monkeypatch.setattr(BallDataManager, "metadata", lambda _: {"grid_size": 20, "bands": 3})
     with pytest.raises(RunError, match=r"not the one that .* was trained on: bands differ"):
         quiet_trainer(load_config(stopped.run))

@@ -50,14 +50,7 @@ _DOUBTFUL_S = 2.0
 
 
 def fuzz(name: str, folder: Path, seed: int, cases: range) -> Outcome:
-    """Run cases of a reader.
-
-    Args:
-        name: In `READERS`.
-        folder: An empty one, to write inputs to.
-        seed: Of all cases.
-        cases: Their numbers.
-    """
+    """Run cases of a reader, by their numbers, in an empty folder."""
     reader = READERS[name]()
     path, outcome = prepare(reader, folder), Outcome()
     for case in cases:

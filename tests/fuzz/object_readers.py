@@ -31,9 +31,8 @@ def _object() -> dict[str, bytes]:
             exported = tetrahedron.export(file_type=suffix)
             files = exported if isinstance(exported, dict) else {f"mesh.{suffix}": exported}
             for name, data in files.items():
-                (folder / name.replace("model", "mesh")).write_bytes(
-                    data.encode() if isinstance(data, str) else data
-                )
+                raw = data.encode() if isinstance(data, str) else data
+                (folder / name.replace("model", "mesh")).write_bytes(raw)
         names = ["environment.exr", "images/000.exr", "spectral/cubes/000.npy", "transforms.json"]
         paths = [*folder.glob("mesh.*"), *folder.glob("*.bin"), *map(folder.joinpath, names)]
         return {path.relative_to(folder).as_posix(): path.read_bytes() for path in sorted(paths)}

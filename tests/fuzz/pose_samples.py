@@ -55,11 +55,8 @@ def colmap_files(is_binary: bool) -> dict[str, bytes]:
         return {f"{name}.txt": data for name, data in files.items()}
     opencv, fisheye = (500, 510, 320, 240, 0.01, -0.02, 0.001, 0), (90, 90, 32, 24, 0, 0, 0, 0)
     cameras = struct.pack("<QiiQQ8diiQQ8d", 2, 1, 4, 640, 480, *opencv, 2, 5, 64, 48, *fisheye)
-    images = (
-        struct.pack("<QI7dI", 2, 1, 1, 0, 0, 0, 0, 0, 4, 1)
-        + b"a b.jpg\0"
-        + struct.pack("<Q2dQ", 1, 1.5, 2, 7)
-    )
+    images = struct.pack("<QI7dI", 2, 1, 1, 0, 0, 0, 0, 0, 4, 1) + b"a b.jpg\0"
+    images += struct.pack("<Q2dQ", 1, 1.5, 2, 7)
     images += struct.pack("<I7dI", 2, 0.7, 0.1, 0, 0.7, 1, 2, 3, 2) + b"c.jpg\0" + struct.pack("<Q", 0)
     points = struct.pack("<QQ3d3BdQII", 2, 7, 0.5, 0.25, 1, 255, 0, 7, 0.3, 1, 1, 0)
     points += struct.pack("<Q3d3BdQ", 8, 1, 2, 3, 1, 2, 3, 0.5, 0)
@@ -94,18 +91,15 @@ def transforms_samples() -> tuple[bytes, ...]:
 
 def opensfm_samples() -> tuple[bytes, ...]:
     """One and two reconstructions of both kinds of camera."""
-    return tuple(
-        json.dumps(part).encode() for part in ([reconstruction()], [reconstruction(), reconstruction(BROWN)])
-    )
+    one, two = reconstruction(), reconstruction(BROWN)
+    return json.dumps([one]).encode(), json.dumps([one, two]).encode()
 
 
 def metashape_samples() -> tuple[bytes, ...]:
     """With and without a place in the world and higher terms."""
     terms = "<k1>0.01</k1><k3>0.001</k3><b2>0.1</b2>"
-    return (
-        metashape_document(ring(3)).encode(),
-        metashape_document(ring(3), component=_SIMILARITY, terms=terms).encode(),
-    )
+    documents = metashape_document(ring(3)), metashape_document(ring(3), component=_SIMILARITY, terms=terms)
+    return tuple(document.encode() for document in documents)
 
 
 def micmac_samples() -> tuple[bytes, ...]:

@@ -9,9 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 
-from tests.fuzz import object_readers, pose_samples, run_readers, scene_readers
+from tests.fuzz import pose_samples, run_readers, scene_readers
 from tests.fuzz.capture_samples import ENVI_DATA, SAMPLES, read_capture, read_with_xml, xml_beside
 from tests.fuzz.mutation import Mutator, Reader, mutate_bytes, mutate_json, mutate_zip
+from tests.fuzz.object_readers import environment_reader, mesh_reader, picture_reader, transforms_reader
 from unmix_plugin.errors import CaptureError
 
 
@@ -47,6 +48,7 @@ def _ply() -> Reader:
 
 
 _ORIENTATION = (("Orientation-a.tif.xml", pose_samples.micmac_samples()[0]),)
+_COLMAP_FILES = [f"{part}.{suffix}" for suffix in ("txt", "bin") for part in pose_samples.COLMAP_PARTS]
 _CALIBRATION = (("AutoCal.xml", pose_samples.CALIBRATED),)
 READERS: dict[str, Callable[[], Reader]] = {
     "transforms.json": scene_readers.transforms_reader,
@@ -75,10 +77,7 @@ READERS: dict[str, Callable[[], Reader]] = {
         _poses, "AutoCal.xml", lambda: (pose_samples.CALIBRATED,), companions=_ORIENTATION
     ),
     "poses LLFF": partial(_poses, "poses_bounds.npy", pose_samples.llff_samples),
-    **{
-        f"poses COLMAP {name}": partial(_colmap, name)
-        for name in (f"{part}.{suffix}" for suffix in ("txt", "bin") for part in pose_samples.COLMAP_PARTS)
-    },
+    **{f"poses COLMAP {name}": partial(_colmap, name) for name in _COLMAP_FILES},
     "points (.ply)": _ply,
     **{f"capture {file_name}": partial(_capture, file_name) for file_name in SAMPLES},
     "capture cube.tif.aux.xml": partial(_xml_beside, "cube.tif.aux.xml"),
@@ -87,16 +86,10 @@ READERS: dict[str, Callable[[], Reader]] = {
     "wavelengths CSV": scene_readers.wavelengths_reader,
     "angles CSV": scene_readers.angles_reader,
     "run measures": run_readers.measures_reader,
-    **{
-        f"object mesh.{suffix}": partial(object_readers.mesh_reader, suffix)
-        for suffix in ("ply", "obj", "glb", "gltf")
-    },
-    **{
-        f"object environment.{suffix}": partial(object_readers.environment_reader, suffix)
-        for suffix in ("exr", "hdr")
-    },
-    "object picture.exr": partial(object_readers.picture_reader, "images/000.exr"),
-    "object picture.npy": partial(object_readers.picture_reader, "spectral/cubes/000.npy"),
-    "object transforms.json": object_readers.transforms_reader,
+    **{f"object mesh.{kind}": partial(mesh_reader, kind) for kind in ("ply", "obj", "glb", "gltf")},
+    **{f"object environment.{kind}": partial(environment_reader, kind) for kind in ("exr", "hdr")},
+    "object picture.exr": partial(picture_reader, "images/000.exr"),
+    "object picture.npy": partial(picture_reader, "spectral/cubes/000.npy"),
+    "object transforms.json": transforms_reader,
 }
 """By name, for messages and tables."""

@@ -67,33 +67,16 @@ def _cameras(count: int = 1) -> Cameras:
 
 def scene_record_reader() -> Reader:
     cameras = _cameras(2).to_json()
-    metadata = {
-        "wavelengths_nm": [450.0, 520.0, 680.0],
-        "illuminant": [1.0, 0.9, 0.8],
-        "has_alpha": True,
-        "grid_resolution": 16,
-        "pixel_size": 0.02,
-        "subpixels": 2,
-    }
-    summary = {
-        "root": "/scenes/pots",
-        "wavelengths_nm": metadata["wavelengths_nm"],
-        "frames": ["a", "b", "c", "d"],
-        "train_indices": [0, 2],
-        "eval_indices": [1, 3],
-        "normalisation": Normalisation(np.eye(3), np.array([0.1, 0.2, 0.3]), 0.5).to_json(),
-        "material_names": ["leaf", "clay"],
-        "endmembers": [[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]],
-        "input_hashes": {"transforms.json": "00"},
-        "options": asdict(SceneOptions()),
-    }
-    content = {
-        "scene_box": [[-1, -1, -1], [1, 1, 1.5]],
-        "metadata": metadata,
-        "train_cameras": cameras,
-        "eval_cameras": cameras,
-        "summary": summary,
-    }
+    bands = {"wavelengths_nm": [450.0, 520.0, 680.0]}
+    metadata = {**bands, "illuminant": [1.0, 0.9, 0.8], "has_alpha": True, "grid_resolution": 16}
+    metadata |= {"pixel_size": 0.02, "subpixels": 2}
+    views = {"frames": ["a", "b", "c", "d"], "train_indices": [0, 2], "eval_indices": [1, 3]}
+    materials = {"material_names": ["leaf", "clay"], "endmembers": [[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]]}
+    summary = {"root": "/scenes/pots", **bands, **views, **materials, "options": asdict(SceneOptions())}
+    summary["normalisation"] = Normalisation(np.eye(3), np.array([0.1, 0.2, 0.3]), 0.5).to_json()
+    summary["input_hashes"] = {"transforms.json": "00"}
+    content = {"scene_box": [[-1, -1, -1], [1, 1, 1.5]], "metadata": metadata, "summary": summary}
+    content |= {"train_cameras": cameras, "eval_cameras": cameras}
     return _json_reader("scene.json", [content], _read_scene_record)
 
 

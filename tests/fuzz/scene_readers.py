@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -58,39 +57,18 @@ wavelength = {0.45, 0.55, 0.65}
 def transforms_reader() -> Reader:
     pose = look_at(np.array([3.0, 1.0, 1.5]), np.zeros(3)).tolist()
     frames = [
-        {
-            "hyperspectral_file_path": f"cubes/{split}_{i}.npy",
-            "file_path": f"{split}_{i}.png",
-            "transform_matrix": pose,
-        }
-        for i, split in enumerate(("train", "eval", "train"))
+        {"hyperspectral_file_path": f"cubes/{name}.npy", "file_path": f"{name}.png", "transform_matrix": pose}
+        for name in ("train_0", "eval_1", "train_2")
     ]
-    frames[0].update(
-        mask_path="mask.png", seg_file_path="s.png", abundance_file_path="a.npy", k1=0.1, fl_x=20
-    )
-    whole = {
-        "camera_model": "OPENCV",
-        "w": 20,
-        "h": 16,
-        "fl_x": 28.0,
-        "fl_y": 28.5,
-        "cx": 10.0,
-        "cy": 8.0,
-        "p1": 0.0,
-        "wavelengths": [450.0, 520.0, 600.5, 680],
-        "materials": ["leaf", "clay"],
-        "illuminant_path": "illuminant.csv",
-        "endmembers_path": "endmembers.csv",
-        "train_filenames": ["train_0.png", "train_2.png"],
-        "test_filenames": ["eval_1.png"],
-        "frames": frames,
-    }
-    bare = {
-        "camera_angle_x": 0.7,
-        "distortion_params": [0.1, 0, 0, 0, 0, 0.2],
-        "wavelengths": [400, 500],
-        "frames": frames[1:],
-    }
+    frames[0] |= {"mask_path": "mask.png", "seg_file_path": "s.png", "abundance_file_path": "a.npy"}
+    frames[0] |= {"k1": 0.1, "fl_x": 20}
+    lens = {"w": 20, "h": 16, "fl_x": 28.0, "fl_y": 28.5, "cx": 10.0, "cy": 8.0, "p1": 0.0}
+    whole = {"camera_model": "OPENCV", **lens, "wavelengths": [450.0, 520.0, 600.5, 680], "frames": frames}
+    whole |= {"illuminant_path": "illuminant.csv", "endmembers_path": "endmembers.csv"}
+    whole |= {"materials": ["leaf", "clay"], "test_filenames": ["eval_1.png"]}
+    whole |= {"train_filenames": ["train_0.png", "train_2.png"]}
+    bare = {"camera_angle_x": 0.7, "distortion_params": [0.1, 0, 0, 0, 0, 0.2]}
+    bare |= {"wavelengths": [400, 500], "frames": frames[1:]}
     samples = tuple(json.dumps(content).encode() for content in (whole, bare))
     named = {path for frame in frames for key, path in frame.items() if key.endswith("_path")}
     beside = tuple((str(path), b"") for path in sorted(named))
@@ -159,12 +137,8 @@ def labels_reader() -> Reader:
     labels = Image.fromarray(np.random.default_rng(0).integers(0, 5, _SIZE, dtype=np.uint8))
     samples = [_encoded(labels, name) for name in ("PNG", "TIFF", "JPEG")]
     samples += [_encoded(labels.convert("P"), "PNG"), *picture_reader().samples[:2]]
-    return replace(
-        picture_reader(),
-        samples=tuple(samples),
-        file_name="labels.png",
-        read=lambda path: read_labels(path, _SIZE),
-    )
+    allowed = (UnreadableImageError,)
+    return Reader(tuple(samples), "labels.png", lambda path: read_labels(path, _SIZE), allowed, mutate_png)
 
 
 def envi_header_reader() -> Reader:
@@ -176,14 +150,8 @@ def envi_header_reader() -> Reader:
 
 
 def envi_values_reader() -> Reader:
-    samples = (np.linspace(0, 9000, 6).astype("<f4").tobytes(),)
-    return Reader(
-        samples,
-        "library.sli",
-        read_library,
-        (SpectrumError,),
-        companions=(("library.hdr", _ENVI.encode()),),
-    )
+    samples, beside = (np.linspace(0, 9000, 6).astype("<f4").tobytes(),), (("library.hdr", _ENVI.encode()),)
+    return Reader(samples, "library.sli", read_library, (SpectrumError,), companions=beside)
 
 
 def spectra_csv_reader() -> Reader:
@@ -225,28 +193,12 @@ def angles_reader() -> Reader:
 
 def cameras_reader() -> Reader:
     pose = look_at(np.array([3.0, 1.0, 1.5]), np.zeros(3))
-    path = {
-        "camera_type": "perspective",
-        "render_width": 64,
-        "render_height": 48,
-        "fps": 24,
-        "seconds": 2.0,
-        "crop": None,
-        "camera_path": [{"camera_to_world": pose.reshape(-1).tolist(), "fov": 50.0, "aspect": 1.3}] * 2,
-    }
-    views = {
-        "format_version": 1,
-        "space": "world",
-        "camera_model": "OPENCV",
-        "w": 20,
-        "h": 16,
-        "fl_x": 28.0,
-        "k1": 0.01,
-        "fps": 12.5,
-        "frames": [
-            {"name": name, "transform_matrix": pose.tolist(), "cx": 9.0} for name in ("left", "right")
-        ],
-    }
+    keys = [{"camera_to_world": pose.reshape(-1).tolist(), "fov": 50.0, "aspect": 1.3}] * 2
+    path = {"camera_type": "perspective", "render_width": 64, "render_height": 48, "camera_path": keys}
+    path |= {"fps": 24, "seconds": 2.0, "crop": None}
+    frames = [{"name": name, "transform_matrix": pose.tolist(), "cx": 9.0} for name in ("left", "right")]
+    lens = {"camera_model": "OPENCV", "w": 20, "h": 16, "fl_x": 28.0, "k1": 0.01}
+    views = {"format_version": 1, "space": "world", **lens, "fps": 12.5, "frames": frames}
     frame = Normalisation(np.eye(3), np.array([0.1, 0.2, 0.3]), 0.5)
     samples = tuple(json.dumps(content).encode() for content in (path, views))
     return Reader(samples, "camera.json", partial(_read_cameras, frame), (ConfigError,), mutate_json)

@@ -21,12 +21,7 @@ FOUND = (
     ("run metrics", 0, b'{"step": 1', b'\xef\xbb\xbf{"step": 1'),
     ("poses MicMac", 0, b"AutoCal.xml", b"AutoCal.xml" + 400 * b"9"),
     ("poses LLFF", 1, b"", b"\x01\0\x80\x7f"),
-    (
-        "poses Metashape",
-        0,
-        b'"adjusted"><resolution width="',
-        b'"adjusted"><resolution width="' + 5000 * b"9",
-    ),
+    ("poses Metashape", 0, b'ted"><resolution width="', b'ted"><resolution width="' + 5000 * b"9"),
     ("poses Metashape", 0, b" 3.872983346207417 1.0", b" 1e300 1.0"),
     ("points (.ply)", 0, b"vertex 2", b"vertex 2" + 30 * b"0"),
     ("poses COLMAP cameras.txt", 0, b"64 48 90 90", b"64 48 90 1e90"),

@@ -18,6 +18,7 @@ from tests.commands.running import SMALL_METHOD, done, run_of
 from tests.gpu.stand_in import StandInTensor, stand_in_gpu
 from tests.neumatex.factory import trained_on, write_object
 from tests.pose_factory import MIDDLE, box_around, cameras
+from tests.products.few_rays import few_rays
 from unmix_plugin.commands.eval import evaluate
 from unmix_plugin.commands.export import PRODUCTS, export
 from unmix_plugin.commands.render import render
@@ -33,6 +34,8 @@ STEPS = 33
 """Enough for updates of the occupancy grid, more rays a pixel, and the specular part."""
 SMALL = {
     "mesh": ["--resolution", 12],
+    "page": ["--resolution", 12],
+    "splats": ["--resolution", 12],
     "point-cloud": ["--num-points", 100],
     "report": ["--max-views", 1],
     "spectrum": ["--view", "eval_002", "--pixel", "8,8"],
@@ -66,8 +69,8 @@ def scene(tmp_path_factory) -> Path:
     return folder
 
 
-def trained(scene: Path, folder: Path, method: str = "unmix-nerf", *words: str) -> Path:
-    given = ["--data", scene, "--output-dir", folder, "--max-num-iterations", STEPS, *words]
+def trained(scene: Path, folder: Path, method: str = "unmix-nerf", *words: str, steps: int = STEPS) -> Path:
+    given = ["--data", scene, "--output-dir", folder, "--max-num-iterations", steps, *words]
     return run_of(done(train, method, *given, "--pipeline.model.initial-opacity", 0.6, *SMALL_METHOD))
 
 
@@ -78,7 +81,7 @@ def cpu_run(scene, tmp_path_factory) -> Path:
 
 @pytest.fixture
 def on_gpu(monkeypatch):
-    with gpu(monkeypatch):
+    with gpu(monkeypatch), few_rays(2_000):
         yield
 
 
@@ -132,7 +135,7 @@ def test_the_published_method_trains_on_a_gpu(scene, tmp_path):
 @pytest.mark.usefixtures("on_gpu")
 def test_views_with_gains_and_corrected_poses_are_rendered_on_a_gpu(scene, tmp_path):
     words = ("--light", "per-view", "--poses", "refine", "--pipeline.model.pose-refinement.lens", "radial")
-    run = trained(scene, tmp_path, "unmix-nerf", *words)
+    run = trained(scene, tmp_path, "unmix-nerf", *words, steps=12)
     done(render, "--run", run, "--cameras", "dataset-train", "--view", 0, "--output", tmp_path / "out")
 
 

@@ -33,15 +33,13 @@ class BallField(CoefficientField):
         self.has_wall, self.gloss = has_wall, gloss
 
     def encode(self, positions: Tensor, known: Tensor | None = None) -> Tensor:
-        """Positions themselves."""
         return positions if known is None else known
 
     def get_density(self, positions: Tensor) -> tuple[Tensor, Tensor]:
-        """A density that rises steeply at the spheres."""
         return self.density_of(positions)
 
     def density_of(self, encoded: Tensor) -> tuple[Tensor, Tensor]:
-        """The same."""
+        """A density that rises steeply at the spheres."""
         radius = encoded.norm(dim=-1)
         solid = torch.sigmoid((RADIUS - radius) / EDGE) * torch.sigmoid((radius - INNER_RADIUS) / EDGE)
         if self.has_wall:
@@ -62,11 +60,8 @@ class BallField(CoefficientField):
         if self.gloss is not None:
             cosines = (torch.nn.functional.normalize(features, dim=1) * directions).sum(dim=1, keepdim=True)
             specular = self.gloss * cosines**2
-        return {
-            "abundances": abundances,
-            "scaled_abundances": SHADE * abundances,
-            "specular_coefficients": specular,
-        }
+        mixture = {"abundances": abundances, "scaled_abundances": SHADE * abundances}
+        return {**mixture, "specular_coefficients": specular}
 
 
 def ball_scene(has_wall: bool = False, gloss: float | None = None, **settings: Any) -> TrainedScene:
@@ -90,11 +85,9 @@ class LamplitBallField(BallField):
 
     @property
     def moving_lamp(self) -> MovingLamp:
-        """Beside the camera."""
         return self.lamp
 
     def density_of(self, encoded: Tensor) -> tuple[Tensor, Tensor]:
-        """A solid ball."""
         radius = (encoded - torch.tensor(LAMPLIT_MIDDLE)).norm(dim=-1)
         return DENSITY * torch.sigmoid((LAMPLIT_RADIUS - radius) / EDGE), encoded
 

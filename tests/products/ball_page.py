@@ -5,13 +5,15 @@ from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
 
 from tests.products.ball_model import ALL_ROUND, RADIUS, ball_scene, cameras_around
+from tests.products.few_rays import few_rays
 from tests.trained.camera_scenes import FRAME
+from unmix_plugin.engine.processes import ALONE
 from unmix_plugin.products.page import page
 from unmix_plugin.products.product import Job
 from unmix_plugin.trained.measures import Measures, Scale
@@ -23,18 +25,11 @@ WORLD_RADIUS = RADIUS / FRAME.scale
 TITLE = '<b>matt</b> & "bright"</script>'
 SCALE = Scale(0.1, "as measured")
 NAMES = ('<img src=x onerror="document.title=1">', "lower & half", "=none")
-VIEWS = tuple(
-    RunView(f"view {index}", camera, "eval" if index == 0 else "train")
-    for index, camera in enumerate(cameras_around([(1.0, 0.2, 0.6), *ALL_ROUND]))
-)
+CAMERAS = enumerate(cameras_around([(1.0, 0.2, 0.6), *ALL_ROUND]))
+VIEWS = tuple(RunView(f"view {index}", camera, "train" if index else "eval") for index, camera in CAMERAS)
 SCENE = ball_scene()
-SCENE = replace(
-    SCENE,
-    frame=FRAME,
-    scale=SCALE,
-    views=VIEWS,
-    materials=replace(SCENE.materials, names=NAMES, light=torch.ones(len(SCENE.bands))),
-)
+MATERIALS = replace(SCENE.materials, names=NAMES, light=torch.ones(len(SCENE.bands)))
+SCENE = replace(SCENE, frame=FRAME, scale=SCALE, views=VIEWS, materials=MATERIALS)
 
 
 def box(low, high):
@@ -54,26 +49,13 @@ REGIONS = {
 def export(folder, scene: Any = SCENE, regions=REGIONS, library=(), resolution=48, edits=None):
     """The facts of a page, what was said while it was made, and its file."""
     said: list[str] = []
-    loaded = SimpleNamespace(
-        scene=scene,
-        materials_scene=scene,
-        scale=scene.scale,
-        measures=Measures(None, regions),
-        scene_name="ball",
-        folder=SimpleNamespace(path=Path("ball/unmix-nerf/run")),
-        config=SimpleNamespace(method_name="unmix-nerf"),
-        record=SimpleNamespace(summary={}),
-    )
-    job = Job(
-        cast("Any", loaded),
-        folder,
-        True,
-        said.append,
-        lambda _: nullcontext(),
-        lambda _, items: iter(items),
-        cast("Any", None),
-    )
+    loaded: Any = SimpleNamespace(scene=scene, materials_scene=scene, scale=scene.scale, scene_name="ball")
+    loaded.measures, loaded.record = Measures(None, regions), SimpleNamespace(summary={})
+    loaded.folder = SimpleNamespace(path=Path("ball/unmix-nerf/run"))
+    loaded.config = SimpleNamespace(method_name="unmix-nerf")
+    job = Job(loaded, folder, True, said.append, lambda _: nullcontext(), lambda _, items: iter(items), ALONE)
     asked = page.Page(resolution=resolution, library=library, edits=edits, title=TITLE)
-    (path,) = page.export(job, asked)
+    with few_rays(20_000):
+        (path,) = page.export(job, asked)
     facts = json.loads(path.read_text().split('id="data-facts">')[1].split("</script>")[0])
     return facts, said, path

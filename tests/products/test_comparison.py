@@ -2,7 +2,6 @@
 
 import csv
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,9 +18,7 @@ def view(mse, nm=NM, mean=(0.1, 0.2, 0.3)):
     return BandErrors(nm, np.array(mean)[: len(nm)], np.array(mse), 64)
 
 
-def compared(
-    folder: Path, name: str, psnr: float, views: dict[str, BandErrors], setting: int = 4
-) -> ComparedRun:
+def compared(folder, name, psnr, views, setting=4):
     pictures = folder / name / "eval"
     (pictures / "rgb").mkdir(parents=True, exist_ok=True)
     for one in views:
@@ -31,7 +28,7 @@ def compared(
     return ComparedRun(folder / name, "unmix-nerf", *found, pictures, {"endmembers": setting, "seed": 42})
 
 
-def rows_of(path: Path) -> list[list[str]]:
+def rows_of(path):
     return list(csv.reader(path.read_text().splitlines()))
 
 
@@ -71,10 +68,8 @@ def test_views_without_a_shared_band_or_a_valid_pixel_are_left_out_and_said(tmp_
     first = compared(tmp_path, "a", 30.0, {"v0": whole, "v1": whole, "v2": blank})
     again = compared(tmp_path, "b", 31.0, {"v0": whole, "v1": whole, "v2": blank})
     found = compare_runs([first, again], tmp_path / "out")
-    assert (found.rows, found.remarks) == (
-        [("psnr", [30.0, 31.0])],
-        ["left out: 1 view without a valid pixel"],
-    )
+    assert found.rows == [("psnr", [30.0, 31.0])]
+    assert found.remarks == ["left out: 1 view without a valid pixel"]
     other = compared(tmp_path, "c", 31.0, {"v0": whole, "v1": infrared, "v2": whole})
     found = compare_runs([first, other], tmp_path / "out")
     assert dict(found.rows) == {"psnr": pytest.approx([20.0, 20.0]), "rmse": pytest.approx([0.1, 0.1])}
@@ -92,12 +87,8 @@ def test_runs_that_share_nothing_are_refused(tmp_path):
     infrared = compared(tmp_path, "c", 30.0, {"v0": view([0.01, 0.01, 0.01], NM + 500)})
     with pytest.raises(ConfigError, match="the runs share no band"):
         compare_runs([first, infrared], tmp_path / "out")
-    of_objects = replace(
-        compared(tmp_path, "d", 30.0, {"v0": view([0.01, 0.01, 0.01])}), bands={}, method="neumatex"
-    )
-    with pytest.raises(
-        ConfigError, match=r"is of unmix-nerf, .* of neumatex: these measure .*; compare runs of"
-    ):
+    of_objects = replace(first, path=tmp_path / "d", bands={}, method="neumatex")
+    with pytest.raises(ConfigError, match=r"of unmix-nerf, .* of neumatex: these measure .*; compare runs"):
         compare_runs([first, of_objects], tmp_path / "out")
     moved = replace(of_objects, path=tmp_path / "e", cameras=np.ones((1, 3, 4)))
     with pytest.raises(ConfigError, match="runs of different scenes"):

@@ -87,9 +87,8 @@ def test_cameras_are_written_where_the_source_says_and_a_placed_scenes_frames_ar
     (tmp_path / "placed.json").write_text(json.dumps(placed))
     for name in ("cameras.json", "placed.json"):
         for view, again in zip(views, read_camera_file(tmp_path / name, FAR).views, strict=True):
-            torch.testing.assert_close(
-                again.camera.camera_to_world, view.camera.camera_to_world, atol=1e-6, rtol=0
-            )
+            found, expected = again.camera.camera_to_world, view.camera.camera_to_world
+            torch.testing.assert_close(found, expected, atol=1e-6, rtol=0)
 
 
 @pytest.mark.parametrize(("distance", "expected"), [(5.0, np.float32), (500.0, np.float64)])

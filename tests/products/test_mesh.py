@@ -46,9 +46,7 @@ GRID = GridPoints.over(SCENE.scene_box.aabb, 48)
 
 @pytest.fixture(scope="module")
 def densities():
-    return np.stack(
-        [sample_field(SCENE, GRID.slice_points(index))[0].numpy() for index in range(GRID.shape[0])]
-    )
+    return np.stack([sample_field(SCENE, GRID.slice_points(i))[0].numpy() for i in range(GRID.shape[0])])
 
 
 @pytest.fixture(scope="module")
@@ -72,9 +70,7 @@ def radii(mesh):
 
 
 def test_marching_finds_the_surfaces_where_they_are(whole):
-    depth = EDGE * np.log(
-        DENSITY / THRESHOLD - 1
-    )  # where the density passes the threshold, before the spheres
+    depth = EDGE * np.log(DENSITY / THRESHOLD - 1)  # of the threshold, before the spheres
     outer, inner = RADIUS + depth, INNER_RADIUS - depth
     off = np.minimum(np.abs(radii(whole) - outer), np.abs(radii(whole) - inner))
     assert off.max() < 0.6 * GRID.cell
@@ -82,13 +78,10 @@ def test_marching_finds_the_surfaces_where_they_are(whole):
     assert volume == pytest.approx(4 / 3 * np.pi * (outer**3 - inner**3), rel=0.02)
 
 
-def test_triangles_and_normals_face_outwards(outside):
+def test_insides_that_no_camera_sees_are_trimmed_and_the_rest_stays_whole_and_faces_outwards(outside):
     outwards = outside.vertices / radii(outside)[:, None]
     np.testing.assert_allclose(np.linalg.norm(outside.normals, axis=1), 1, atol=1e-9)
     assert (outside.normals * outwards).sum(axis=1).min() > 0.5
-
-
-def test_insides_that_no_camera_sees_are_trimmed_and_the_rest_stays_whole(outside):
     assert radii(outside).min() > RADIUS - 0.05
     shape = trimesh.Trimesh(outside.vertices, outside.faces, process=False)
     assert shape.area == pytest.approx(4 * np.pi * RADIUS**2, rel=0.12)
@@ -190,9 +183,7 @@ def test_gltf_alone_is_in_metres_where_the_scene_has_a_scale_and_y_is_up_in_it(f
     np.testing.assert_array_equal(plain, scaled)
 
 
-def test_numbers_in_ply_and_glb_are_the_same_floats_and_vertices_have_the_material_of_their_half(
-    files, outside
-):
+def test_ply_and_glb_have_the_same_floats_and_vertices_the_material_of_their_half(files, outside):
     vertices, glb = PlyData.read(files[".ply"])["vertex"], loaded_mesh(files[".glb"])
     world = FRAME.to_world(outside.vertices).astype(np.float32)
     np.testing.assert_array_equal(np.stack([vertices[axis] for axis in "xyz"], axis=1), world)
@@ -254,17 +245,17 @@ def test_a_textured_glb_has_its_segmentation_and_abundances_as_variants(textured
 
 
 @pytest.mark.parametrize(
-    ("density", "smoothing", "said"),
+    ("asked", "said"),
     [
-        (0.0, 1.0, "--density is 0"),
-        (float("nan"), 1.0, "--density is nan"),
-        (None, -0.5, "--smoothing is -0.5"),
-        (None, 9.0, "choose 0 to 8 cells"),
+        (Mesh(density=0.0), "--density is 0"),
+        (Mesh(density=float("nan")), "--density is nan"),
+        (Mesh(smoothing=-0.5), "--smoothing is -0.5"),
+        (Mesh(smoothing=9.0), "choose 0 to 8 cells"),
     ],
 )
-def test_impossible_settings_are_refused(density, smoothing, said):
+def test_impossible_settings_are_refused(asked, said):
     with pytest.raises(ConfigError, match=said):
-        export(MagicMock(spec=Job), Mesh(density=density, smoothing=smoothing))
+        export(MagicMock(spec=Job), asked)
 
 
 def test_surfaces_that_are_none_and_textures_that_are_too_small_or_of_no_size_are_refused(densities, outside):

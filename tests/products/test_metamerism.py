@@ -57,7 +57,8 @@ def known(monkeypatch):
     return library
 
 
-def pairs_of(found):
+def pairs_of(materials=MATERIALS, **asked):
+    found = _find_metamers(materials, Metamerism(lights=BOTH, **asked))
     return [{found.names[pair.first], found.names[pair.second]} for pair in found.pairs]
 
 
@@ -70,12 +71,9 @@ def exported(folder, materials, lights=BOTH, **asked):
 
 
 def test_pairs_are_of_the_run_or_of_the_library_or_of_both_with_the_runs_first():
-    run, library, every = (
-        pairs_of(_find_metamers(MATERIALS, Metamerism(surfaces=of, lights=BOTH)))
-        for of in ("run", "library", "all")
-    )
-    assert run == [{"slate", "paint"}]
-    assert library == [{"own/a", "own/b"}]
+    assert pairs_of(surfaces="run") == [{"slate", "paint"}]
+    assert pairs_of(surfaces="library") == [{"own/a", "own/b"}]
+    every = pairs_of(surfaces="all")
     assert {"slate", "own/a"} in every
     assert {"slate", "paint"} in every
     assert every[-1] == {"own/a", "own/b"}
@@ -95,16 +93,15 @@ def test_bands_that_no_eye_sees_play_no_part(known):
     spectra = torch.full((2, 61), 0.4)
     spectra[:, :31] = MATERIALS.endmembers
     light = torch.tensor(np.concatenate([SCENE_LIGHT, np.ones(30)])).float()
-    greys = [
-        LibraryMaterial(f"own/to {end}", Bands.of((390, end)), np.full(2, 0.4), "test") for end in (600, 790)
-    ]
+    ends = {f"own/to {end}": Bands.of((390, end)) for end in (600, 790)}
+    greys = (LibraryMaterial(name, bands, np.full(2, 0.4), "test") for name, bands in ends.items())
     known[0] = MaterialLibrary((*greys, *LIBRARY.materials))
     materials = Materials(wide, spectra, torch.zeros(0, 61), names=MATERIALS.names, light=light)
     found = _find_metamers(materials, Metamerism(lights=BOTH))
     assert found.bands == Bands.of(np.linspace(400, 780, 39))
     assert "own/to 790" in found.names
     assert "own/to 600" not in found.names  # which does not reach all bands
-    assert {"slate", "paint"} in pairs_of(found)
+    assert {"slate", "paint"} in pairs_of(materials)
     infrared = Bands.of(np.linspace(800, 1000, 61))
     with pytest.raises(SpectrumError, match="no visible light"):
         _find_metamers(Materials(infrared, spectra, torch.zeros(0, 61)), Metamerism(lights=BOTH))
@@ -115,9 +112,8 @@ def test_bands_that_the_scenes_light_leaves_dark_play_no_part(dark):
     """There an endmember says nothing of the material that it is."""
     light = SCENE_LIGHT * np.where(np.arange(31) < 4, dark, 1.0)
     spectra = torch.tensor(np.stack([GREY, LIBRARY.materials[0].reflectance]) * light + 1e-4).float()
-    materials = Materials(
-        BANDS, spectra, torch.zeros(0, 31), names=("slate", "a"), light=torch.tensor(light).float()
-    )
+    lit = {"names": ("slate", "a"), "light": torch.tensor(light).float()}
+    materials = Materials(BANDS, spectra, torch.zeros(0, 31), **lit)
     found = _find_metamers(materials, Metamerism(lights=BOTH))
     assert found.bands == Bands.of(np.linspace(440, 700, 27))
     own, same = (found.reflectance[found.names.index(name)] for name in ("a", "own/a"))
@@ -139,12 +135,11 @@ def test_a_library_in_percent_is_refused_unless_it_says_so(tmp_path, monkeypatch
     monkeypatch.undo()
     paints = tmp_path / "paints.csv"
     rows = np.stack([BANDS.centers_nm, 100 * GREY, 100 * hidden(0.25)], axis=1)
-    asked = Metamerism(lights=BOTH, library=(paints,), surfaces="library")
     np.savetxt(paints, rows, delimiter=",", header="wavelength,a %,b (%)", comments="")
-    assert pairs_of(_find_metamers(MATERIALS, asked)) == [{"a", "b"}]
+    assert pairs_of(library=(paints,), surfaces="library") == [{"a", "b"}]
     np.savetxt(paints, rows, delimiter=",", header="wavelength,a,b", comments="")
     with pytest.raises(SpectrumError, match=r"a .paints.csv. must be in reflectances, 1 for white; found 40"):
-        _find_metamers(MATERIALS, asked)
+        pairs_of(library=(paints,), surfaces="library")
 
 
 def test_the_table_names_what_differs_and_swatches_have_the_colours_that_an_adapted_eye_sees(tmp_path):

@@ -31,12 +31,14 @@ def test_regions_that_can_not_be_shown_are_said(exported):
         assert any(one.startswith(text) for one in said)
 
 
-def test_a_page_of_an_edited_run_says_so(exported, tmp_path):
-    facts, said, _ = export(tmp_path, regions={}, edits=Path("aged.yml"))
+def test_a_page_of_an_edited_run_says_so_and_one_that_can_not_be_small_that(exported, tmp_path, monkeypatch):
+    monkeypatch.setattr(page, "MOST_BYTES", 1000)
+    facts, said, path = export(tmp_path, regions={}, edits=Path("aged.yml"))
     note = "Edited: shown with the edits of aged.yml, not as found."
     assert note in facts["notes"]
     assert note in said
     assert not any("Edited" in text for text in exported[0]["notes"])
+    assert f"the page has {path.stat().st_size / 1e6:.1f} MB, more than a mail takes" in said
 
 
 def test_a_library_is_given_in_full_and_too_large_or_strange_ones_are_refused(tmp_path, monkeypatch):
@@ -66,10 +68,9 @@ def test_a_page_keeps_both_limits_and_each_surface_is_made_once(exported, tmp_pa
     found = page.find_surface
     monkeypatch.setattr(page, "find_surface", lambda job, cells: tried.append(cells) or found(job, cells))
     most = round(1.15 * exported[0]["arrays"]["faces"]["count"] / 3)
-    fixed = 900_000  # bytes of scripts and library
-    size = exported[2].stat().st_size
+    arrays = exported[2].read_text().split('id="data-arrays">')[1].split("<")[0]
     monkeypatch.setattr(page, "MOST_TRIANGLES", most)
-    monkeypatch.setattr(page, "MOST_BYTES", fixed + (size - fixed) // 2)
+    monkeypatch.setattr(page, "MOST_BYTES", exported[2].stat().st_size - len(arrays) // 8)
     facts, said, path = export(tmp_path, resolution=64)
     assert facts["arrays"]["faces"]["count"] / 3 <= most
     assert path.stat().st_size <= page.MOST_BYTES
@@ -108,17 +109,8 @@ def test_bands_that_the_light_leaves_dark_are_those_of_the_package():
     light = torch.ones(len(SCENE.bands))
     light[2] = 1e-4
     lit = replace(SCENE.materials, light=light)
-    assert (
-        page._spectral_facts(lit, None)["is_lit"]
-        == lit.is_lit.tolist()
-        == [band != 2 for band in range(len(light))]
-    )
-
-
-def test_a_page_that_can_not_be_small_enough_is_said_to_be_large(tmp_path, monkeypatch):
-    monkeypatch.setattr(page, "MOST_BYTES", 1000)
-    _, said, path = export(tmp_path, regions={})
-    assert f"the page has {path.stat().st_size / 1e6:.1f} MB, more than a mail takes" in said
+    found = page._spectral_facts(lit, None)["is_lit"]
+    assert found == lit.is_lit.tolist() == [band != 2 for band in range(len(light))]
 
 
 def test_through_a_sensor_no_known_spectra_and_no_other_lights_are_offered(tmp_path):

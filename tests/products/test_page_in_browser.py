@@ -89,9 +89,8 @@ def test_layers_match_renders_of_the_same_camera_and_differ(browser, tmp_path):
 
 def assert_layers_match_and_differ(scene, opened):
     view = scene.views[-1]
-    opened.evaluate(
-        f"unmixPage.lookThrough(unmixPage.facts.cameras.findIndex((one) => one.name === '{view.name}'))"
-    )
+    camera = f"unmixPage.facts.cameras.findIndex((one) => one.name === '{view.name}')"
+    opened.evaluate(f"unmixPage.lookThrough({camera})")
     rendered = scene.look(view.camera.resized(SIDE, SIDE))
     plain = SCENE.look(view.camera.resized(SIDE, SIDE))["rgb"]
     assert (rendered["rgb"] - plain).abs().max() > 0.1  # which gloss adds
@@ -151,9 +150,7 @@ def test_nothing_is_cut_off_however_far_one_goes_away(opened):
 def probes(opened, *names):
     """Numbers of the probes of the page."""
     fields = ", ".join(names)
-    return opened.evaluate(
-        f"unmixPage.probes.map(({{ name, {fields} }}) => ({{ name, {fields} }}))".replace(", }", " }")
-    )
+    return opened.evaluate(f"unmixPage.probes.map(({{ {fields} }}) => ({{ {fields} }}))")
 
 
 def stroke(opened, corners):
@@ -167,10 +164,8 @@ def stroke(opened, corners):
 
 
 def test_kept_regions_are_shown_by_name_with_area_mean_spread_and_mixture(opened):
-    assert opened.locator(".probe input[type=text]").evaluate_all("all => all.map((one) => one.value)") == [
-        "below",
-        "cap <b>",
-    ]
+    names = opened.locator(".probe input[type=text]")
+    assert names.evaluate_all("all => all.map((one) => one.value)") == ["below", "cap <b>"]
     cap, below = probes(opened, "area", "spectrum", "spread", "mixture")
     assert cap["area"] == pytest.approx(np.pi * WORLD_RADIUS**2, rel=0.03)
     assert below["area"] == pytest.approx(2 * np.pi * WORLD_RADIUS**2, rel=0.04)
@@ -239,9 +234,8 @@ def test_features_are_those_of_the_package(opened):
             [spectra.tolist(), nm.tolist()],
         )
         values = torch.from_numpy(spectra)
-        np.testing.assert_allclose(
-            [one["removed"] for one in found], continuum_removed(values, nm), atol=1e-9
-        )
+        removed = [one["removed"] for one in found]
+        np.testing.assert_allclose(removed, continuum_removed(values, nm), atol=1e-9)
         for measure in ("depth", "centre", "area"):
             numbers = np.array([one[measure] for one in found], dtype=np.float64)
             np.testing.assert_allclose(numbers, absorption(values, nm, measure), atol=1e-6)
@@ -292,16 +286,10 @@ def test_names_are_text_in_a_table_and_one_is_changed_after_the_other(opened):
 def shape_in_colour(shape, away):
     """What a page shows of triangles without bands, that are looked at from `away`."""
     positions = FRAME.to_world(np.array(shape.vertices))
-    areas = trimesh.triangles.area(positions[shape.faces])
-    content = page.PageContent(
-        {
-            "positions": positions,
-            "faces": np.array(shape.faces),
-            "areas": vertex_areas(areas, shape.faces, len(positions)),
-        },
-        {"lights": [{"name": "white", "factors": [], "notes": []}], "notes": [], "colour": "grey"},
-        {},
-    )
+    areas = vertex_areas(trimesh.triangles.area(positions[shape.faces]), shape.faces, len(positions))
+    facts = {"lights": [{"name": "white", "factors": [], "notes": []}], "notes": [], "colour": "grey"}
+    arrays = {"positions": positions, "faces": np.array(shape.faces), "areas": areas}
+    content = page.PageContent(arrays, facts, {})
     (camera,) = cameras_around([away])
     views = (RunView("from there", camera, "train"),)
     return SimpleNamespace(page_content=lambda _: content, views=views, frame=FRAME, scale=SCALE)

@@ -138,9 +138,8 @@ def test_evaluation_figures_are_whole_with_more_as_many_and_fewer_materials(num_
     truth = _SceneTruth(given.bands, num_true, torch.rand(num_true, 8).double())
     labels = (view.segmentation % num_true).masked_fill(view.segmentation == 255, 255)
     abundances = torch.nn.functional.one_hot(labels.long() % num_true, num_true).float()
-    seen = ViewTruth(
-        "view", view.spectra, torch.ones(12, 16, dtype=torch.bool), view.accumulation, labels, abundances
-    )
+    valid = torch.ones(12, 16, dtype=torch.bool)
+    seen = ViewTruth("view", view.spectra, valid, view.accumulation, labels, abundances)
     evaluation = Evaluation(truth, given.endmembers)
     evaluation.add(seen, view)
     look, matching = material_look(evaluation), evaluation.segmentation().matching

@@ -3,6 +3,7 @@
 import json
 import tracemalloc
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -79,17 +80,13 @@ def test_a_view_marks_what_it_sees_and_not_what_is_behind(surface):
 
 def test_regions_come_back_as_they_were_kept(tmp_path):
     run, mask = RunFolder(tmp_path), np.random.default_rng(0).random((40, 40)) > 0.5
-    kept = {
-        "a b": Box((0.0, 1.0, 2.0), (1.0, 2.0, 3.0)),
-        "m": OfMaterial(2),
-        "v": InView.of_mask(CAMERA, mask),
-    }
+    some = Box((0.0, 1.0, 2.0), (1.0, 2.0, 3.0))
+    kept = {"a b": some, "m": OfMaterial(2), "v": InView.of_mask(CAMERA, mask)}
     for name, region in kept.items():
         keep_region(run, name, region)
     found = read_measures(run).regions
     assert (found["a b"], found["m"], list(found)) == (kept["a b"], kept["m"], list(kept))
-    view = found["v"]
-    assert isinstance(view, InView)
+    view: Any = found["v"]
     np.testing.assert_array_equal(view.mask(), mask)
     keep_region(run, "m", None)
     assert list(read_measures(run).regions) == ["a b", "v"]

@@ -22,9 +22,7 @@ from unmix_plugin.errors import ConfigError
 
 def assert_rigid(cameras):
     rotations = cameras.camera_to_world[:, :, :3]
-    torch.testing.assert_close(
-        rotations.transpose(1, 2) @ rotations, torch.eye(3).expand(len(cameras), 3, 3), atol=1e-5, rtol=0
-    )
+    assert_close(rotations.transpose(1, 2) @ rotations, torch.eye(3).expand_as(rotations), atol=1e-5, rtol=0)
     assert (torch.linalg.det(rotations) > 0).all()
 
 
@@ -48,9 +46,8 @@ def test_an_orbit_goes_once_round_at_the_cameras_distance_and_looks_at_what_they
 
 
 def test_the_horizon_of_an_orbit_is_level_even_where_cameras_look_down_unevenly():
-    poses = [
-        look_at(4 * np.array([np.cos(a), np.sin(a), 0.2 + 0.1 * a]), np.zeros(3)) for a in np.arange(6.0)
-    ]
+    places = [4 * np.array([np.cos(a), np.sin(a), 0.2 + 0.1 * a]) for a in np.arange(6.0)]
+    poses = [look_at(place, np.zeros(3)) for place in places]
     path = orbit(cameras_at(poses), BOX, 8)
     np.testing.assert_allclose(path.camera_to_world[:, 2, 0], 0.0, atol=1e-5)
     assert (path.camera_to_world[:, 2, 1] > 0).all()
@@ -146,9 +143,8 @@ def test_a_shrunk_camera_has_few_pixels_of_the_same_view():
     small = camera.shrunk(300)
     assert small.width * small.height == pytest.approx(300, rel=0.1)
     assert small.width / small.height == pytest.approx(camera.width / camera.height, rel=0.1)
-    assert float(small.focal_px[0, 1]) / small.height == pytest.approx(
-        float(camera.focal_px[0, 1]) / camera.height
-    )
+    angles = [float(one.focal_px[0, 1]) / one.height for one in (small, camera)]
+    assert angles[0] == pytest.approx(angles[1])
     assert camera.shrunk(camera.width * camera.height) is camera
 
 

@@ -13,9 +13,7 @@ from unmix_plugin.engine.geometry.cameras import Cameras, distort, undistort
 WIDTH, HEIGHT = 64, 48
 
 
-def make_cameras(
-    count: int = 3, distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-) -> Cameras:
+def make_cameras(count: int = 3, distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)) -> Cameras:
     generator = torch.Generator().manual_seed(count)
     rotations = torch.linalg.qr(torch.randn(count, 3, 3, generator=generator))[0]
     rotations = rotations * torch.linalg.det(rotations)[:, None, None]
@@ -30,9 +28,8 @@ def make_cameras(
     )
 
 
-pixels = st.lists(
-    st.tuples(st.floats(0.0, WIDTH, width=32), st.floats(0.0, HEIGHT, width=32)), min_size=1, max_size=8
-)
+places = st.tuples(st.floats(0.0, WIDTH, width=32), st.floats(0.0, HEIGHT, width=32))
+pixels = st.lists(places, min_size=1, max_size=8)
 terms = (st.floats(-0.2, 0.2), st.floats(-0.05, 0.05), st.floats(-0.01, 0.01), st.floats(-0.01, 0.01))
 lenses = st.tuples(*terms) | st.tuples(*terms, st.floats(-0.03, 0.03), st.floats(-0.02, 0.02))
 
@@ -53,9 +50,7 @@ def test_a_point_that_no_ray_meets_is_not_projected_into_the_image(k1, k2, index
     towards = torch.randn(200, 3, generator=torch.Generator().manual_seed(index))
     points = cameras.camera_to_world[index, :, 3] + towards
     projected, depths = cameras.project(points, index)
-    inside = (
-        (depths > 0) & (projected >= 0).all(dim=-1) & (projected < torch.tensor([WIDTH, HEIGHT])).all(dim=-1)
-    )
+    inside = (depths > 0) & ((projected >= 0) & (projected < torch.tensor([WIDTH, HEIGHT]))).all(dim=-1)
     rays = cameras.generate_rays(torch.full((int(inside.sum()),), index), projected[inside])
     towards = torch.nn.functional.normalize(towards[inside], dim=-1)
     assert ((towards * rays.directions).sum(dim=-1) > 0.999).all()
@@ -98,14 +93,8 @@ def test_distortion_agrees_with_the_opencv_formula_at_a_worked_point():
     assert_close(bent, torch.tensor([[expected_x, expected_y]], dtype=torch.float64), atol=1e-7, rtol=0)
 
 
-CAMERA = Cameras(
-    torch.eye(3, 4)[None],
-    torch.full((1, 2), 50.0),
-    torch.tensor([[32.0, 24.0]]),
-    torch.zeros(1, 4),
-    WIDTH,
-    HEIGHT,
-)
+LENS = torch.full((1, 2), 50.0), torch.tensor([[32.0, 24.0]]), torch.zeros(1, 4)
+CAMERA = Cameras(torch.eye(3, 4)[None], *LENS, WIDTH, HEIGHT)
 
 
 def test_axes_are_opengl():
@@ -194,8 +183,6 @@ def test_cameras_brought_to_one_size_see_the_same_height_of_the_scene():
     alike = cameras.one_size()
     assert [alike.size(index) for index in range(3)] == [(64, 48)] * 3
     for x, y in ((0.0, 0.0), (16.0, 12.0), (5.5, 2.0)):
-        [before, after] = (
-            which.generate_rays(torch.tensor([1]), torch.tensor([point])).directions
-            for which, point in ((cameras, [x, y]), (alike, [4 * x, 4 * y]))
-        )
-        assert_close(after, before)
+        before = cameras.generate_rays(torch.tensor([1]), torch.tensor([[x, y]]))
+        after = alike.generate_rays(torch.tensor([1]), torch.tensor([[4 * x, 4 * y]]))
+        assert_close(after.directions, before.directions)

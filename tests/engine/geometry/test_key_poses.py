@@ -2,6 +2,7 @@
 
 import json
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -22,16 +23,17 @@ def pose(turn: tuple[float, float, float], place: tuple[float, float, float]) ->
 
 def keys(distortion: float = 0.0, p1: float = 0.0) -> Cameras:
     """A frame camera, and two line cameras that move and turn."""
-    poses = torch.stack(
-        [
-            pose((0.1, 0.2, 0.3), (0.0, 0.0, 4.0)),
-            pose((0.0, 0.0, 0.0), (0.0, 1.5, 4.0)),
-            pose((0.0, 0.1, 0.0), (0.2, 0.0, 4.1)),
-            pose((0.0, 0.1, 0.1), (0.0, -1.5, 4.0)),
-            pose((0.3, 0.0, 0.0), (0.0, 0.0, 4.0)),
-            pose((-0.3, 0.0, 0.0), (0.0, 0.0, 4.0)),
-        ]
+    turns = (
+        (0.1, 0.2, 0.3),
+        (0.0, 0.0, 0.0),
+        (0.0, 0.1, 0.0),
+        (0.0, 0.1, 0.1),
+        (0.3, 0.0, 0.0),
+        (-0.3, 0.0, 0.0),
     )
+    still = (0.0, 0.0, 4.0)
+    places = still, (0.0, 1.5, 4.0), (0.2, 0.0, 4.1), (0.0, -1.5, 4.0), still, still
+    poses = torch.stack(list(map(pose, turns, places)))
     heights = torch.tensor([0.5, 0.5, 15.0, 39.5, 0.0, 40.0])
     key_poses = KeyPoses(poses, heights, (1, 3, 2))
     middle = key_poses.at(torch.arange(3), torch.full((3,), HEIGHT / 2))
@@ -80,9 +82,8 @@ def test_a_row_sees_only_its_own_line(p1):
     cameras = keys(p1=p1)
     rows = torch.arange(HEIGHT) + 0.5
     for x in (0.5, 11.5):
-        rays = cameras.generate_rays(
-            torch.ones(HEIGHT, dtype=torch.int64), torch.stack([torch.full_like(rows, x), rows], dim=1)
-        )
+        pixels = torch.stack([torch.full_like(rows, x), rows], dim=1)
+        rays = cameras.generate_rays(torch.ones(HEIGHT, dtype=torch.int64), pixels)
         poses = cameras.poses_at(rays.camera_indices, rows)
         local = torch.einsum("nji,nj->ni", poses[:, :, :3], rays.directions)
         expected = torch.nn.functional.normalize(torch.tensor([(x - 6.0) / 30.0, 0.0, -1.0]), dim=0)
@@ -135,11 +136,11 @@ def test_other_sizes_see_the_same_directions():
 def test_json_gives_back_the_same_bits_and_frame_cameras_have_none():
     cameras = keys()
     back = Cameras.from_json(json.loads(json.dumps(cameras.to_json())))
-    assert back.key_poses is not None
-    assert cameras.key_poses is not None
-    assert torch.equal(back.key_poses.poses, cameras.key_poses.poses)
-    assert torch.equal(back.key_poses.heights, cameras.key_poses.heights)
-    assert back.key_poses.counts == cameras.key_poses.counts
+    found: Any = back.key_poses
+    expected: Any = cameras.key_poses
+    assert torch.equal(found.poses, expected.poses)
+    assert torch.equal(found.heights, expected.heights)
+    assert found.counts == expected.counts
     assert cameras[0].key_poses is None
     assert "key_poses" not in cameras[0].to_json()
     assert cameras[[2, 0]].key_poses is not None

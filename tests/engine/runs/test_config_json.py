@@ -71,7 +71,7 @@ def without_targets(config: Any) -> Any:
 
 @settings(deadline=None, max_examples=150)
 @given(everything)
-def test_any_config_comes_back_equal(config: Everything):
+def test_any_config_comes_back_equal(config):
     text = json.dumps(config_to_json(config), allow_nan=False)
     assert without_targets(config_from_json(json.loads(text), Everything())) == without_targets(config)
 
@@ -105,7 +105,7 @@ def test_a_registered_method_comes_back_with_its_classes_and_what_a_file_lacks_i
         ({"optimizer": {"lr": -1.0}}, r"config\.optimizer: .*lr above 0 and finite \(got -1.0\)$"),
     ],
 )
-def test_a_value_that_does_not_fit_is_named_by_its_path(values: Any, message: str):
+def test_a_value_that_does_not_fit_is_named_by_its_path(values, message):
     with pytest.raises(ConfigError, match=message):
         config_from_json(values, Everything())
 
@@ -130,7 +130,7 @@ def test_what_no_file_can_hold_is_refused_before_it_is_written():
         ({"method_name": "../x"}, "a file name as method-name"),
     ],
 )
-def test_impossible_training_settings_are_refused(settings_: dict[str, Any], rule: str):
+def test_impossible_training_settings_are_refused(settings_, rule):
     with pytest.raises(ConfigError, match=rule):
         replace(TrainerConfig(), **settings_)
 

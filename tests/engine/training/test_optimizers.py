@@ -36,9 +36,7 @@ fractions = st.floats(0.0, 1.0)
 
 @settings(deadline=None)
 @given(configs, fractions, fractions)
-def test_a_schedule_falls_by_equal_factors_from_lr_to_its_final_factor(
-    config: OptimizerConfig, a: float, b: float
-):
+def test_a_schedule_falls_by_equal_factors_from_lr_to_its_final_factor(config, a, b):
     assert math.isclose(_learning_rate(config, -a), config.lr, rel_tol=1e-12)
     assert math.isclose(_learning_rate(config, 1.0 + a), config.lr * config.final_factor, rel_tol=1e-9)
     ratio = _learning_rate(config, a) / _learning_rate(config, b)
@@ -47,10 +45,8 @@ def test_a_schedule_falls_by_equal_factors_from_lr_to_its_final_factor(
 
 def test_each_group_has_its_own_settings_and_rate():
     a, b = nn.Parameter(torch.ones(2)), nn.Parameter(torch.ones(3))
-    settings_ = {
-        "a": OptimizerConfig(lr=0.1, weight_decay=0.5),
-        "b": OptimizerConfig(lr=1.0, final_factor=0.25),
-    }
+    of_b = OptimizerConfig(lr=1.0, final_factor=0.25)
+    settings_ = {"a": OptimizerConfig(lr=0.1, weight_decay=0.5), "b": of_b}
     optimizer = build_optimizer({"a": [a], "b": [b], "unused": []}, settings_)
     rates = set_learning_rates(optimizer, settings_, 0.5)
     assert rates == {"a": pytest.approx(0.1 * math.sqrt(0.1)), "b": pytest.approx(0.5)}
@@ -89,7 +85,7 @@ def make_guard():
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-def test_a_bad_loss_or_any_one_bad_gradient_entry_is_refused(bad: float):
+def test_a_bad_loss_or_any_one_bad_gradient_entry_is_refused(bad):
     guard, params = make_guard()
     assert guard.check(torch.tensor(0.5)) == (True, 0.5)
     assert guard.check(torch.tensor(bad))[0] is False
@@ -103,7 +99,7 @@ def test_a_bad_loss_or_any_one_bad_gradient_entry_is_refused(bad: float):
     assert guard.check(torch.tensor(1.0))[0] is True
 
 
-def test_only_refusals_in_a_row_end_training(monkeypatch: pytest.MonkeyPatch):
+def test_only_refusals_in_a_row_end_training(monkeypatch):
     monkeypatch.setattr(guards, "_MAX_IN_A_ROW", 2)
     guard, _ = make_guard()
     for loss in (math.nan, 1.0, math.nan, 1.0):
@@ -127,7 +123,7 @@ def poisoned_trainer(config: TrainerConfig, steps: set[int]) -> Trainer:
     return trainer
 
 
-def test_a_poisoned_step_changes_no_parameter_and_is_counted_and_logged(short_config: TrainerConfig):
+def test_a_poisoned_step_changes_no_parameter_and_is_counted_and_logged(short_config):
     trainer = poisoned_trainer(short_config, {5})
     seen: list[torch.Tensor] = []
     grid = next(trainer.pipeline.model.parameters())
@@ -143,9 +139,7 @@ def test_a_poisoned_step_changes_no_parameter_and_is_counted_and_logged(short_co
     assert '"loss": null' in trainer.run.metrics_path.read_text()
 
 
-def test_training_that_stays_poisoned_ends_with_the_last_checkpoint_whole(
-    short_config: TrainerConfig, monkeypatch: pytest.MonkeyPatch
-):
+def test_training_that_stays_poisoned_ends_with_the_last_checkpoint_whole(short_config, monkeypatch):
     monkeypatch.setattr(guards, "_MAX_IN_A_ROW", 3)
     trainer = poisoned_trainer(short_config, set(range(6, 100)))
     with pytest.raises(RunError, match="3 training steps in a row"):
@@ -182,16 +176,14 @@ def test_an_interval_updates_at_its_steps_with_the_decay_to_its_power_after_the_
 
 @pytest.mark.parametrize("num_steps", [400, 4000])
 @pytest.mark.parametrize("interval", [1, 8])
-def test_before_the_decay_bites_the_average_spans_the_same_part_of_a_training_of_any_length(
-    num_steps, interval
-):
+def test_before_the_decay_bites_an_average_spans_the_same_part_of_any_training(num_steps, interval):
     weights = [step / num_steps for step in range(1, num_steps + 1)]
     # A mean in which the weight of a step grows with its number to the 8th lags a tenth of the way behind.
     found = averaged(weights, decay=0.99999, interval=interval).values["weight"].item()
     assert found == pytest.approx(0.9, abs=0.02)
 
 
-def test_a_run_with_an_average_is_evaluated_and_loaded_with_it(short_config: TrainerConfig):
+def test_a_run_with_an_average_is_evaluated_and_loaded_with_it(short_config):
     config = replace(short_config, average_decay=0.8, steps_per_eval_all_images=12)
     trainer = quiet_trainer(config)
     trainer.train()
@@ -210,11 +202,11 @@ def test_a_run_with_an_average_is_evaluated_and_loaded_with_it(short_config: Tra
     assert torch.equal(trainer.average.values["field.grid"], grid)
 
 
-def test_the_average_takes_parameters_as_callbacks_after_the_step_leave_them(short_config: TrainerConfig):
+def test_the_average_takes_parameters_as_callbacks_after_the_step_leave_them(short_config):
     trainer = quiet_trainer(replace(short_config, average_decay=0.0))
     grid = dict(trainer.pipeline.model.named_parameters())["field.grid"]
 
-    def bound(step: int, progress: float) -> None:  # noqa: ARG001
+    def bound(step, progress):  # noqa: ARG001
         with torch.no_grad():
             grid.clamp_(-1e-6, 1e-6)
 

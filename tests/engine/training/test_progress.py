@@ -7,7 +7,6 @@ import json
 import math
 import re
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -46,11 +45,11 @@ def test_progress_is_the_nearer_limits_fraction_and_never_falls(limit, step, spe
 
 
 @pytest.fixture
-def fake_time(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+def fake_time(monkeypatch):
     """A clock that goes on by `tick` whenever it is read, and by hand."""
     fake = SimpleNamespace(now=0.0, tick=0.0)
 
-    def read() -> float:
+    def read():
         fake.now += fake.tick
         return fake.now
 
@@ -58,9 +57,7 @@ def fake_time(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     return fake
 
 
-def test_a_limit_in_seconds_ends_training_in_time_with_the_schedule_run_out(
-    short_config: TrainerConfig, fake_time
-):
+def test_a_limit_in_seconds_ends_training_in_time_with_the_schedule_run_out(short_config, fake_time):
     fake_time.tick = 1 / 64
     trainer = Trainer(replace(short_config, max_num_iterations=None, max_seconds=0.5, steps_per_save=0))
     record = trainer.train()
@@ -71,13 +68,10 @@ def test_a_limit_in_seconds_ends_training_in_time_with_the_schedule_run_out(
     assert (resumed.steps, resumed.train_seconds) == (48, 0.75)
 
 
-def test_seconds_of_evaluation_saving_and_warming_up_do_not_count(
-    short_config: TrainerConfig, monkeypatch: pytest.MonkeyPatch, fake_time
-):
+def test_seconds_of_evaluation_saving_and_warming_up_do_not_count(short_config, monkeypatch, fake_time):
     fake_time.tick = 1 / 64
-    trainer = Trainer(
-        replace(short_config, max_num_iterations=3, steps_per_eval_all_images=1, steps_per_save=1)
-    )
+    often = {"steps_per_eval_all_images": 1, "steps_per_save": 1}
+    trainer = Trainer(replace(short_config, max_num_iterations=3, **often))
     slow = {"eval": 0, "warm": 0}
 
     def evaluate():
@@ -85,7 +79,7 @@ def test_seconds_of_evaluation_saving_and_warming_up_do_not_count(
         fake_time.now += 400
         return {"psnr": 1.0}, {}
 
-    def warm_up() -> None:
+    def warm_up():
         slow["warm"] += 1
         fake_time.now += 400
 
@@ -120,7 +114,7 @@ def test_where_the_output_is_no_terminal_each_status_is_one_plain_line():
 
 
 @pytest.mark.parametrize("width", [40, 60, 200])
-def test_on_a_terminal_the_bar_is_redrawn_in_place_and_the_time_left_is_never_cut_off(width: int):
+def test_on_a_terminal_the_bar_is_redrawn_in_place_and_the_time_left_is_never_cut_off(width):
     out = io.StringIO()
     with ProgressDisplay(Console(file=out, force_terminal=True, width=width, color_system=None)) as display:
         display.show(STATUS)
@@ -132,9 +126,9 @@ def test_on_a_terminal_the_bar_is_redrawn_in_place_and_the_time_left_is_never_cu
     assert out.getvalue().count("a line that stays") == 1
 
 
-def test_a_console_that_is_gone_ends_training_with_all_saved(short_config: TrainerConfig, monkeypatch):
+def test_a_console_that_is_gone_ends_training_with_all_saved(short_config, monkeypatch):
     class Gone(io.StringIO):
-        def write(self, _: str) -> int:
+        def write(self, _):
             raise BrokenPipeError
 
     monkeypatch.setattr(ProgressDisplay, "is_due", property(lambda self: not self.is_closed))
@@ -145,7 +139,7 @@ def test_a_console_that_is_gone_ends_training_with_all_saved(short_config: Train
     assert "its output is closed" in trainer.run.log_path.read_text()
 
 
-def test_training_off_a_terminal_prints_lines_without_control_codes(short_config: TrainerConfig, monkeypatch):
+def test_training_off_a_terminal_prints_lines_without_control_codes(short_config, monkeypatch):
     monkeypatch.setattr(ProgressDisplay, "is_due", property(lambda _: True))
     out = io.StringIO()
     config = replace(short_config, steps_per_eval_all_images=6)
@@ -161,15 +155,14 @@ HAS_TENSORBOARD = importlib.util.find_spec("tensorboard") is not None
 
 
 @pytest.fixture
-def without_tensorboard(monkeypatch: pytest.MonkeyPatch):
+def without_tensorboard(monkeypatch):
     real = importlib.util.find_spec
-    monkeypatch.setattr(
-        importlib.util, "find_spec", lambda name: None if name == "tensorboard" else real(name)
-    )
+    find_spec = lambda name: None if name == "tensorboard" else real(name)  # noqa: E731
+    monkeypatch.setattr(importlib.util, "find_spec", find_spec)
 
 
 @pytest.mark.usefixtures("without_tensorboard")
-def test_each_write_is_one_json_line_and_what_is_not_finite_is_null(tmp_path: Path):
+def test_each_write_is_one_json_line_and_what_is_not_finite_is_null(tmp_path):
     writer = MetricsWriter(RunFolder(tmp_path))
     writer.write(1, 0.12345, "train", {"loss": 0.5, "psnr": math.inf})
     writer.write(2, 1.0, "eval_all", {"psnr": 30.0})
@@ -184,7 +177,7 @@ def test_each_write_is_one_json_line_and_what_is_not_finite_is_null(tmp_path: Pa
 
 
 @pytest.mark.skipif(not HAS_TENSORBOARD, reason="tensorboard is not installed")
-def test_tensorboard_gets_the_same_numbers_where_it_is_installed(tmp_path: Path):
+def test_tensorboard_gets_the_same_numbers_where_it_is_installed(tmp_path):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     writer = MetricsWriter(RunFolder(tmp_path))
@@ -198,7 +191,7 @@ def test_tensorboard_gets_the_same_numbers_where_it_is_installed(tmp_path: Path)
 
 
 @pytest.mark.usefixtures("without_tensorboard")
-def test_resuming_cuts_off_later_lines_odd_ones_and_a_half_written_one(tmp_path: Path):
+def test_resuming_cuts_off_later_lines_odd_ones_and_a_half_written_one(tmp_path):
     path = tmp_path / "metrics.jsonl"
     odd = b"\xff\xfe\n" + b"[" * 100_000 + b"\nnull\n[1]\n{}\n"
     path.write_bytes(b'\xef\xbb\xbf{"step": 1}\n' + odd + b'{"step": 2}\n{"step": 3}\n{"step": 4, "lo')
@@ -206,19 +199,17 @@ def test_resuming_cuts_off_later_lines_odd_ones_and_a_half_written_one(tmp_path:
     assert [json.loads(line)["step"] for line in path.read_text().splitlines()] == [1, 2, 3]
 
 
-def test_a_full_disk_while_saving_ends_training_with_a_clear_error_and_the_last_checkpoint(
-    short_config: TrainerConfig, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_full_disk_while_saving_ends_training_with_its_last_checkpoint(short_config, monkeypatch):
     trainer = Trainer(short_config)
     saved: list[int] = []
     original = trainer.save
 
-    def save_then_fill_the_disk() -> None:
+    def save_then_fill_the_disk():
         original()
         saved.append(trainer.step)
         monkeypatch.setattr("os.write", refuse)
 
-    def refuse(*_: object) -> int:
+    def refuse(*_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(trainer, "save", save_then_fill_the_disk)

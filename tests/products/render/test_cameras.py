@@ -1,5 +1,6 @@
 """Which cameras are chosen."""
 
+import itertools
 from dataclasses import replace
 
 import pytest
@@ -97,10 +98,8 @@ def test_what_cannot_be_rendered_is_refused(request_, said):
 
 
 def test_views_of_several_sizes_are_rendered_as_large_as_the_largest():
-    views = [
-        replace(view, camera=view.camera.resized(*[(20, 15), (40, 30), (10, 10)][index % 3]))
-        for index, view in enumerate(SCENE.views)
-    ]
+    sizes = itertools.cycle([(20, 15), (40, 30), (10, 10)])
+    views = (replace(view, camera=view.camera.resized(*next(sizes))) for view in SCENE.views)
     rig = replace(SCENE, views=tuple(views))
     cameras = choose_cameras(rig, RenderOptions())
     assert [view.camera.size(0) for view in cameras.views] == [(40, 30)] * 3

@@ -15,10 +15,9 @@ SCENE = make_scene()
 
 def formats(*outputs, asked=(), is_path=False):
     """Formats by output."""
-    found = {}
-    for product in choose_formats(outputs, asked, SCENE, is_path):
-        found.setdefault(product.output.name, []).append(product.format)
-    return found
+    chosen = choose_formats(outputs, asked, SCENE, is_path)
+    names = dict.fromkeys(one.output.name for one in chosen)
+    return {name: [one.format for one in chosen if one.output.name == name] for name in names}
 
 
 def test_all_is_every_output_that_the_model_has_and_each_has_formats_that_suit_it():

@@ -2,19 +2,19 @@
 
 import json
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 import spectral.io.envi as envi
 import tifffile
-from spectral.io.bipfile import BipFile
 
 from tests.products.ball_model import RADIUS, SHADE, ball_scene, lamplit_ball_scene
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.products.render import RenderOptions, files
 from unmix_plugin.products.render.cameras import choose_cameras
 from unmix_plugin.products.render.files import choose_formats
-from unmix_plugin.products.render.job import RenderJob, Survey, take_survey
+from unmix_plugin.products.render.job import RenderJob, take_survey
 from unmix_plugin.products.render.maps import map_camera
 from unmix_plugin.products.render.pictures import Palette
 from unmix_plugin.scenes.scene import Normalisation
@@ -27,14 +27,21 @@ SCENE = replace(ball_scene(), frame=Normalisation(TURN, np.zeros(3), 0.25, PLACE
 SCALE = Scale(1.0, "test")
 
 
+def rendered(folder, names, formats, pixel_size, cameras="map", scene=SCENE, scale: Scale | None = SCALE):
+    """The camera of a map that is rendered into a folder, and its survey."""
+    chosen = choose_cameras(scene, RenderOptions(cameras=cameras, pixel_size=pixel_size), scale)
+    outputs = files.with_units(choose_formats(names, formats, scene, False), chosen.map_info)
+    survey = take_survey(scene, chosen.views, [one.output for one in outputs], chosen.map_info)
+    job = RenderJob(scene, chosen, outputs, survey, folder)
+    job.render(job.blocks())
+    return chosen.views[0].camera, survey
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("maps")
-    for source in ("map", "map:east"):
-        cameras = choose_cameras(SCENE, RenderOptions(cameras=source, pixel_size=0.2), SCALE)
-        outputs = choose_formats(["accumulation", "spectral"], ["tif", "envi"], SCENE, False)
-        job = RenderJob(SCENE, cameras, outputs, Survey(), folder)
-        job.render(job.blocks())
+    for cameras in ("map", "map:east"):
+        rendered(folder, ["accumulation", "spectral"], ["tif", "envi"], 0.2, cameras)
     return folder
 
 
@@ -52,19 +59,16 @@ def test_a_geotiff_has_the_ball_where_it_is(folder, view, axes):
         tags, opacity = file.pages.first.tags, file.asarray()
         pixel, tie = tags[33550].value, tags[33922].value
         keys = np.array(tags[34735].value).reshape(-1, 4)
-    assert pixel == (0.2, 0.2, 0.0)
-    assert tie[:3] == (0.0, 0.0, 0.0)
-    reach = RADIUS / 0.25
-    middle = PLACE[list(axes)]
-    expected = [middle[0] - reach, middle[0] + reach, middle[1] + reach, middle[1] - reach]
+    assert (pixel, tie[:3]) == ((0.2, 0.2, 0.0), (0.0, 0.0, 0.0))
+    reach, (x, y) = RADIUS / 0.25, PLACE[list(axes)]
+    expected = [x - reach, x + reach, y + reach, y - reach]
     np.testing.assert_allclose(outline(opacity, tie[3], tie[4], 0.2), expected, atol=0.2)
     assert {tuple(key) for key in keys[1:]} >= {(1024, 0, 1, 1), (1025, 0, 1, 1), (3076, 0, 1, 9001)}
     assert len(keys) == keys[0, 3] + 1
 
 
 def test_an_envi_header_says_the_same(folder):
-    image = envi.open(folder / "spectral" / "map_top.hdr")
-    assert isinstance(image, BipFile)
+    image: Any = envi.open(folder / "spectral" / "map_top.hdr")
     kind, column, row, left, top, x, y, units = image.metadata["map info"]
     assert (kind, float(column), float(row), float(x), float(y)) == ("Arbitrary", 1, 1, 0.2, 0.2)
     assert units == "units=Meters"
@@ -93,18 +97,16 @@ def test_a_map_along_no_axes_of_the_world_says_the_size_of_pixels_and_no_coordin
 
 
 def test_units_and_a_coordinate_system_that_are_known_are_written():
-    utm, national = (
-        choose_cameras(SCENE, RenderOptions(cameras="map", pixel_size=1.0, epsg=code), SCALE).map_info
-        for code in (32632, 25832)
-    )
-    assert utm is not None
-    assert national is not None
-    for info, code in ((utm, 32632), (national, 25832)):
-        directory = {tuple(key) for key in np.array(info.geotiff[2][3]).reshape(-1, 4)[1:]}
+    kinds = {}
+    for code in (32632, 25832):
+        asked = RenderOptions(cameras="map", pixel_size=1.0, epsg=code)
+        found: Any = choose_cameras(SCENE, asked, SCALE).map_info
+        directory = {tuple(key) for key in np.array(found.geotiff[2][3]).reshape(-1, 4)[1:]}
         assert directory >= {(1024, 0, 1, 1), (3072, 0, 1, code)}
-    kind, *_, zone, half, datum, units = utm.envi["map info"]
+        kinds[code] = found.envi["map info"]
+    kind, *_, zone, half, datum, units = kinds[32632]
     assert (kind, zone, half, datum, units) == ("UTM", 32, "North", "WGS-84", "units=Meters")
-    assert national.envi["map info"][0] == "Arbitrary"
+    assert kinds[25832][0] == "Arbitrary"
     with pytest.raises(ConfigError, match=r"--epsg needs a world in metres, .*: leave --epsg out"):
         choose_cameras(SCENE, RenderOptions(cameras="map", epsg=32632), None)
     _, info = map_camera(SCENE, None, "top", 0.2)
@@ -117,15 +119,10 @@ def test_units_and_a_coordinate_system_that_are_known_are_written():
     ("scale", "unit", "factor"), [(Scale(0.01, "test"), "metres", 0.01), (None, "world units", 1.0)]
 )
 def test_heights_of_a_map_are_in_the_unit_of_its_coordinates_and_say_it(scale, unit, factor, tmp_path):
-    pixel_size = 0.5 * factor
-    cameras = choose_cameras(SCENE, RenderOptions(cameras="map", pixel_size=pixel_size), scale)
-    names = ["depth", "ray_distance", "accumulation"]
-    outputs = files.with_units(choose_formats(names, ["tif"], SCENE, False), cameras.map_info)
-    survey = take_survey(SCENE, cameras.views, [one.output for one in outputs], cameras.map_info)
-    job = RenderJob(SCENE, cameras, outputs, survey, tmp_path)
-    job.render(job.blocks())
-    view = SCENE.look(cameras.views[0].camera)
-    for name, units in (("depth", factor), ("ray_distance", factor), ("accumulation", 1.0)):
+    factors = {"depth": factor, "ray_distance": factor, "accumulation": 1.0}
+    camera, survey = rendered(tmp_path, [*factors], ["tif"], 0.5 * factor, scale=scale)
+    view = SCENE.look(camera)
+    for name, units in factors.items():
         with tifffile.TiffFile(tmp_path / name / "map_top.tif") as file:
             found, said = file.asarray(), json.loads(file.pages.first.tags[270].value)["what"]
         np.testing.assert_allclose(found, units * view[name].numpy(), rtol=1e-5)
@@ -150,33 +147,27 @@ def test_more_than_a_tiff_can_hold_is_written_as_bigtiff(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("request_", "message"),
+    ("cameras", "more", "message"),
     [
-        (RenderOptions(cameras="map", pixel_size=0.0), "--pixel-size is 0; it must be greater than 0"),
-        (RenderOptions(cameras="map", pixel_size=1e-7), "--pixel-size 1e-07: .* expected whole numbers"),
-        (RenderOptions(cameras="map:up"), "--cameras map:up: expected top, bottom"),
-        (RenderOptions(cameras="map:0,0,0"), "--cameras map:0,0,0: expected top"),
-        (
-            RenderOptions(cameras="map", size="10x10"),
-            "--cameras map has one view of the size that --pixel-size",
-        ),
-        (RenderOptions(cameras="orbit", pixel_size=0.1), "--pixel-size is for --cameras map"),
-        (RenderOptions(cameras="orbit", epsg=32632), "--epsg is for --cameras map"),
-        (RenderOptions(cameras="map", epsg=4326), "--epsg 4326 is no projected coordinate system"),
-        (RenderOptions(cameras="map:east", epsg=32632), "--epsg is for maps from above"),
+        ("map", {"pixel_size": 0.0}, "--pixel-size is 0; it must be greater than 0"),
+        ("map", {"pixel_size": 1e-7}, "--pixel-size 1e-07: .* expected whole numbers"),
+        ("map:up", {}, "--cameras map:up: expected top, bottom"),
+        ("map:0,0,0", {}, "--cameras map:0,0,0: expected top"),
+        ("map", {"size": "10x10"}, "--cameras map has one view of the size that --pixel-size"),
+        ("orbit", {"pixel_size": 0.1}, "--pixel-size is for --cameras map"),
+        ("orbit", {"epsg": 32632}, "--epsg is for --cameras map"),
+        ("map", {"epsg": 4326}, "--epsg 4326 is no projected coordinate system"),
+        ("map:east", {"epsg": 32632}, "--epsg is for maps from above"),
     ],
 )
-def test_what_makes_no_map_is_refused(request_, message):
+def test_what_makes_no_map_is_refused(cameras, more, message):
     with pytest.raises(ConfigError, match=message):
-        choose_cameras(SCENE, request_, SCALE)
+        choose_cameras(SCENE, RenderOptions(cameras=cameras, **more), SCALE)
 
 
 def test_where_a_lamp_goes_with_the_camera_a_map_is_lit_squarely(tmp_path):
     scene = lamplit_ball_scene()
-    cameras = choose_cameras(scene, RenderOptions(cameras="map", pixel_size=0.05))
-    outputs = choose_formats(["spectral", "accumulation"], ["npy"], scene, False)
-    job = RenderJob(scene, cameras, outputs, Survey(), tmp_path)
-    job.render(job.blocks())
+    rendered(tmp_path, ["spectral", "accumulation"], ["npy"], 0.05, scene=scene, scale=None)
     spectra, opacity = (np.load(tmp_path / name / "map_top.npy") for name in ("spectral", "accumulation"))
     found = spectra[opacity > 0.99] / opacity[opacity > 0.99, None]
     assert len(found) > 30

@@ -24,9 +24,8 @@ class Outline(HTMLParser):
 
     def handle_starttag(self, tag, attrs):
         values = {name: value or "" for name, value in attrs}
-        self.fetched += [
-            values[name] for name in ("src", "srcset", "data", "action", "poster") if name in values
-        ]
+        fetching = ("src", "srcset", "data", "action", "poster")
+        self.fetched += [values[name] for name in fetching if name in values]
         self.ids += [values["id"]] if "id" in values else []
         if tag == "a":
             self.links.append(values["href"])

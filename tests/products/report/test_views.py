@@ -45,7 +45,7 @@ def striped(name, offset=0.0):
     return PredictedView(wrong, alpha, shares, labels, shares), truth
 
 
-def gathered(offsets, with_truth=True, materials=MATERIALS):
+def gathered(offsets, with_truth=True, materials=MATERIALS) -> Any:
     truth = _SceneTruth(BANDS, 3, SPECTRA.double(), ("clay", "leaf", "paint"))
     evaluation = Evaluation(truth, materials.endmembers, materials.names) if with_truth else None
     views = ReportViews(materials, evaluation, {"view_0"})
@@ -53,11 +53,6 @@ def gathered(offsets, with_truth=True, materials=MATERIALS):
         view, measured = striped(f"view_{index}", offset)
         views.add(f"view_{index}", view, measured if with_truth else None)
     return views
-
-
-def of_bands(views):
-    assert views.error_of_bands is not None
-    return views.error_of_bands
 
 
 NOTHING: dict[str, Any] = dict.fromkeys(("page", "light_unknown", "figures"))
@@ -79,7 +74,7 @@ def shown_texts(views: ReportViews, **others) -> dict[str, str]:
 def test_error_against_wavelength_and_proportions_are_over_pixels_that_show_matter():
     views = gathered([0.1, 0.0])
     expected = [[0.1 / math.sqrt(2), 0, 0, 0, 0], [-0.05, 0, 0, 0, 0]]
-    np.testing.assert_allclose(of_bands(views), expected, atol=1e-7)
+    np.testing.assert_allclose(views.error_of_bands, expected, atol=1e-7)
     np.testing.assert_allclose(views.proportions, 1 / 3)
     assert gathered([]).proportions.tolist() == [0, 0, 0]
     texts = shown_texts(views)
@@ -180,8 +175,6 @@ def test_pixels_that_do_not_count_show_no_label_no_error_and_no_agreement():
     views = gathered([])
     views.add("masked", wrong, replace(truth, valid=~hidden))
     [shown] = views.shown
-    assert shown.error is not None
-    assert shown.labels is not None
     assert (shown.labels[hidden] == 255).all()
     assert (shown.labels[8] != 255).all()
     grey = eight_bits(np.full(3, NEUTRAL))
@@ -198,7 +191,7 @@ def test_the_gain_fitted_to_a_view_counts_in_its_pictures_and_errors():
     views = gathered([])
     views.add("bright", replace(view, gain=gain), replace(truth, spectra=truth.spectra * gain))
     [shown] = views.shown
-    np.testing.assert_allclose(of_bands(views), 0, atol=1e-7)
+    np.testing.assert_allclose(views.error_of_bands, 0, atol=1e-7)
     np.testing.assert_array_equal(shown.predicted, shown.measured)
 
 
