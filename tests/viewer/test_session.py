@@ -40,7 +40,9 @@ def test_a_reload_keeps_camera_layer_and_edits_and_another_browser_starts_anew(v
         page.wait_until(lambda: len(decoded(page.last_picture)) == 24)
         time.sleep(0.5)  # the edit can reach the picture after the layer
         before = decoded(page.last_picture)
+    until = time.monotonic() + 60
     while viewer.num_clients:
+        assert time.monotonic() < until
         time.sleep(0.01)
     with page_of(viewer, storage=storage) as page:
         page.look_from(0.3)
