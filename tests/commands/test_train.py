@@ -130,10 +130,10 @@ def test_ctrl_c_saves_exits_130_and_says_how_to_go_on_which_then_works(trained, 
     path = run_of(ended)
     command = ended.err.splitlines()[-1].removeprefix("go on with: ").split()
     assert command == ["unmix-train", "unmix-nerf", "--load-run", str(path)]
+    assert (path / "endmembers.csv").is_file()
     resumed = done(train, *command[1:], "--max-num-iterations", 6)
     assert resumed.last_line == f"run: {path}"
     assert json.loads((path / "training.json").read_text())["steps"] == 6
-    assert (path / "endmembers.csv").is_file()
 
 
 @pytest.mark.slow

@@ -171,22 +171,32 @@ def finish(trainer: Trainer, console: Console) -> None:
         Interrupted: training was stopped on request.
     """
     from unmix_plugin.commands.reporting import say, spectral_scene
+    from unmix_plugin.engine.training.training_control import Interrupted
 
-    record = trainer.train()
+    try:
+        record = trainer.train()
+    except Interrupted as stop:
+        if stop.step == trainer.step:  # or files of an earlier training would stay beside what was saved
+            _write_results(trainer)
+        raise
     speed = f"{record.train_rays_per_second:,.0f} rays/s"
     say(console, f"trained {counted(record.steps, 'step')} in {record.train_seconds:.1f} s, {speed}")
     if record.skipped_steps:
         skipped = f"{counted(record.skipped_steps, 'step')} changed nothing"
         say(console, f"warning: {skipped}: loss or gradients were not finite, see {trainer.run.log_path}")
-    averaged = nullcontext() if trainer.average is None else trainer.average.swapped_in()
-    with trainer.control.device.training_turn(), averaged:
-        trainer.pipeline.model.write_results(trainer.run.path)
+    _write_results(trainer)
     data = trainer.pipeline.datamanager
     if spectral_scene(data) is not None:  # remarks name settings of spectral methods
         num_pixels = int(data.metadata().get("num_train_pixels", 0))
         few = _remark_on_passes(record.total_rays, num_pixels)
         for remark in [*_remarks(trainer.run.metrics_path), *few]:
             say(console, remark)
+
+
+def _write_results(trainer: Trainer) -> None:
+    averaged = nullcontext() if trainer.average is None else trainer.average.swapped_in()
+    with trainer.control.device.training_turn(), averaged:
+        trainer.pipeline.model.write_results(trainer.run.path)
 
 
 _FEWEST_LINES = 8
