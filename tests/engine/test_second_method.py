@@ -2,14 +2,14 @@
 
 import ast
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
 import torch
 
 from tests.engine import rgb_nerf_plugin
-from tests.engine.rgb_nerf_plugin import GridField, RgbNerf
+from tests.engine.rgb_nerf_plugin import GridField, RgbNerf, RgbNerfConfig
 from tests.engine.stopped_runs import finished, newest, quiet_trainer, stop_at
 from unmix_plugin.engine.registry import find_method
 from unmix_plugin.engine.runs.checkpoints import save_checkpoint
@@ -86,6 +86,26 @@ def test_a_parameter_that_is_trained_from_a_resume_on_joins_the_average(short_co
 
 def with_a_gain(model: RgbNerf) -> None:
     model.field, model.gain = GridField(20), torch.nn.Parameter(torch.ones(()))
+
+
+def test_what_could_be_trained_and_is_in_no_group_is_named(short_config, monkeypatch):
+    assert "no parameter group" not in quiet_trainer(short_config).pipeline.reasons
+    monkeypatch.setattr(RgbNerf, "populate_modules", with_a_gain)
+    trainer = quiet_trainer(short_config)
+    said = "warning: gain of the model can be trained, but no parameter group has it"
+    assert trainer.pipeline.reasons == said
+    assert said in trainer.run.log_path.read_text()
+
+
+def test_settings_that_would_be_read_back_as_another_class_are_refused_before_training(short_config):
+    @dataclass(frozen=True)
+    class Twin(RgbNerfConfig):
+        """The same fields under another name."""
+
+    pipeline = replace(short_config.pipeline, model=Twin())
+    with pytest.raises(ConfigError, match="classes that may stand in one place must differ in their fields"):
+        quiet_trainer(replace(short_config, pipeline=pipeline))
+    assert not short_config.output_dir.exists()
 
 
 def test_groups_that_a_model_resets_between_steps_are_forgotten(short_config, monkeypatch):

@@ -27,7 +27,7 @@ from unmix_plugin.engine.training.progress import (
 )
 from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.engine.training.training_control import Interrupted
-from unmix_plugin.errors import RunError
+from unmix_plugin.errors import ConfigError, RunError
 
 limits = st.tuples(st.none() | st.integers(0, 10_000), st.none() | st.floats(1e-3, 1e4)).filter(any)
 steps, seconds = st.integers(0, 20_000), st.floats(0, 2e4)
@@ -174,6 +174,12 @@ def test_each_write_is_one_json_line_and_what_is_not_finite_is_null(tmp_path):
         {"step": 2, "seconds": 1.0, "split": "eval_all", "psnr": 30.0},
     ]
     assert not (tmp_path / "tensorboard").exists()
+
+
+@pytest.mark.parametrize("name", ["step", "seconds", "split"])
+def test_a_metric_that_would_overwrite_where_its_line_belongs_is_refused(tmp_path, name):
+    with pytest.raises(ConfigError, match=f"no metric of a model may be called {name}"):
+        MetricsWriter(RunFolder(tmp_path)).write(1, 0.1, "train", {name: 7.0})
 
 
 @pytest.mark.skipif(not HAS_TENSORBOARD, reason="tensorboard is not installed")

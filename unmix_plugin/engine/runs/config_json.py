@@ -38,11 +38,14 @@ def config_to_json(value: Any) -> Any:
     raise TypeError(f"a config holds a {type(value).__name__}, which JSON has no form for: {value!r}")
 
 
-def require_kept(config: Any) -> None:
-    """Refuse settings that a run could not keep. Raises ConfigError: they are read back as others, or not at all.
-    TypeError: as `config_to_json`."""
-    if config_from_json(config_to_json(config), config) != config:
-        raise ConfigError("the settings are read back as others: keys of mappings must be text, lists lists")
+def require_kept(config: Any, default: Any) -> None:
+    """Refuse settings that a run could not keep. Raises ConfigError: they are read back as others, or not at all, also
+    over the method's `default`. TypeError: as `config_to_json`."""
+    if any(config_from_json(config_to_json(config), base) != config for base in (config, default)):
+        raise ConfigError(
+            "the settings are read back as others: keys of mappings must be text, lists lists, and classes that may "
+            "stand in one place must differ in their fields"
+        )
 
 
 def flattened(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -23,7 +23,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 
 from unmix_plugin.engine.runs.atomic_files import cannot_write, parse_plain_json, write_file
 from unmix_plugin.engine.runs.run_folder import RunFolder
-from unmix_plugin.errors import RunError
+from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.limits import MOST_TABLE_BYTES, read_bounded, regular_file
 
 if TYPE_CHECKING:
@@ -171,11 +171,13 @@ class MetricsWriter:
     def write(
         self, step: int, seconds: float, split: Literal["train", "eval_all"], values: Mapping[str, float]
     ) -> None:
-        """One line, of a training batch or of all evaluation views; numbers that are not finite become null."""
+        """One line, of a training batch or of all evaluation views; numbers that are not finite become null. Raises
+        ConfigError: a metric has the name of what says where the line belongs."""
+        line = {"step": step, "seconds": round(seconds, 3), "split": split}
+        if taken := sorted(line.keys() & values.keys()):
+            raise ConfigError(f"no metric of a model may be called {', '.join(taken)}: give it another name")
         finite = {name: value if math.isfinite(value) else None for name, value in values.items()}
-        _append(
-            self._path, json.dumps({"step": step, "seconds": round(seconds, 3), "split": split, **finite})
-        )
+        _append(self._path, json.dumps({**line, **finite}))
         if self._board is not None:
             for name, value in values.items():
                 self._board.add_scalar(f"{split}/{name}", value, step)

@@ -33,7 +33,7 @@ from unmix_plugin.engine.training.optimizers import (
     set_learning_rates,
 )
 from unmix_plugin.engine.training.training_control import stop_signals
-from unmix_plugin.errors import ConfigError, RunError, UnmixError
+from unmix_plugin.errors import ConfigError, RunError, UnmixError, name_some
 
 
 @dataclass(frozen=True)
@@ -75,6 +75,15 @@ class TrainingSteps:
                 f"the parameter group {', '.join(stray)} has parameters that no module of the model holds, nor would a "
                 "checkpoint: make them attributes, or entries of an nn.ParameterList"
             )
+        trained = {id(param) for own in groups.values() for param in own}
+        left = {
+            name
+            for name, param in pipeline.model.named_parameters()
+            if param.requires_grad and param.numel() and id(param) not in trained
+        }
+        if left:
+            said = f"warning: {name_some(sorted(left))} of the model can be trained, but no parameter group has it"
+            pipeline.reasons = "\n".join(filter(None, [pipeline.reasons, said]))
         self.optimizer = build_optimizer(groups, configs)
         self.guard = GradientGuard(self.optimizer)
         self.callbacks = [

@@ -12,6 +12,7 @@ from rich.console import Console
 from unmix_plugin.engine.configs import TrainerConfig, refuse_changes_at_start
 from unmix_plugin.engine.machine import keep_freed_memory
 from unmix_plugin.engine.processes import ALONE, Processes
+from unmix_plugin.engine.registry import discover_methods
 from unmix_plugin.engine.runs.atomic_files import write_run_json
 from unmix_plugin.engine.runs.checkpoints import (
     AVERAGE,
@@ -71,7 +72,8 @@ class Trainer:
             SceneError, ConfigError: scene or settings are wrong; nothing has been written.
             RunError: the run to resume is unusable, the model's values are not finite, or the folder can't be made.
         """
-        require_kept(config)
+        known = discover_methods()[0].get(config.method_name)
+        require_kept(config, config if known is None else known.config)
         self.console = console or ProgressConsole()
         self.control = control or TrainingControl()
         self.processes = processes
