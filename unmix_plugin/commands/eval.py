@@ -186,7 +186,7 @@ def _report(console: Console, run: ComparedRun, found: Evaluated, is_edited: boo
         print(f"not measured, since the scene does not have the truth for it: {', '.join(unknown)}")
     print(f"{run.pictures / 'metrics.json'}  these figures, and those of each view")
     if found.num_pictures:
-        kinds = ": rgb/, segmentation/ and abundances/, truth beside prediction"
+        kinds = ": rgb/, segmentation/ and abundances/, truth, where there is one, beside prediction"
         drawn = counted(found.num_pictures, "picture")
         print(f"{run.pictures}  {drawn}{kinds if found.has_materials else ''}")
 
