@@ -247,7 +247,16 @@ def parallax_warning(positions: Float[np.ndarray, "N 3"], box: SceneBox) -> str 
 
 def lens_warning(cameras: Cameras) -> str | None:
     """A warning if a lens with distortion reaches less than the picture: no direction leads to the rest of it."""
-    lost = [_unreached(cameras[index]) for index in range(len(cameras)) if not cameras.is_line_camera(index)]
+    shares: dict[tuple[float, ...], float] = {}  # views mostly share a lens
+    lost = []
+    for index in range(len(cameras) if cameras.is_distorted else 0):
+        if not cameras.is_line_camera(index):
+            camera = cameras[index]
+            numbers = torch.cat([camera.focal_px, camera.center_px, camera.distortion], dim=1)
+            lens = (camera.width, camera.height, *numbers[0].tolist())
+            if lens not in shares:
+                shares[lens] = _unreached(camera)
+            lost.append(shares[lens])
     if max(lost, default=0.0) <= _MOST_UNREACHED:
         return None
     views = counted(sum(share > _MOST_UNREACHED for share in lost), "view")
