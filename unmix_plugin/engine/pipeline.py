@@ -47,9 +47,12 @@ class Pipeline(nn.Module):
         warnings join `reasons`."""
         with torch.no_grad():
             self.model.initialise(self.datamanager.initial_data(), torch.Generator().manual_seed(self.seed))
-        said = [*self.datamanager.warnings(), *self.model.warnings()]
-        warnings = [f"warning: {warning}" for warning in said]
-        self.reasons = "\n".join(filter(None, [*self.datamanager.reasons(), self.reasons, *warnings]))
+        self.reasons = "\n".join(filter(None, [*self.datamanager.reasons(), self.reasons]))
+        self.warn(*self.datamanager.warnings(), *self.model.warnings())
+
+    def warn(self, *said: str) -> None:
+        """Let warnings join `reasons`, a line each."""
+        self.reasons = "\n".join(filter(None, [self.reasons, *(f"warning: {one}" for one in said)]))
 
     def draw_as(self, rank: int) -> None:
         """Draw the rays of process number `rank` from now on; those of the first are the ones of a single process."""

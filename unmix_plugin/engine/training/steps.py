@@ -82,8 +82,9 @@ class TrainingSteps:
             if param.requires_grad and param.numel() and id(param) not in trained
         }
         if left:
-            said = f"warning: {name_some(sorted(left))} of the model can be trained, but no parameter group has it"
-            pipeline.reasons = "\n".join(filter(None, [pipeline.reasons, said]))
+            pipeline.warn(
+                f"{name_some(sorted(left))} of the model can be trained, but no parameter group has it"
+            )
         self.optimizer = build_optimizer(groups, configs)
         self.guard = GradientGuard(self.optimizer)
         self.callbacks = [

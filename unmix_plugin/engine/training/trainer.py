@@ -289,7 +289,4 @@ class Trainer:
         if self.average is not None and averaged:
             self.average.restore(averaged, record.average_updates)
         write_config(self.run, self.config)
-        passed_over = (
-            f"warning: passed over a damaged checkpoint: {reason}" for reason in checkpoint.damaged
-        )
-        self.pipeline.reasons = "\n".join(filter(None, [self.pipeline.reasons, *passed_over]))
+        self.pipeline.warn(*(f"passed over a damaged checkpoint: {reason}" for reason in checkpoint.damaged))
