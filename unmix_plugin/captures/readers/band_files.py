@@ -38,13 +38,12 @@ def open_band_folder(folder: Path, open_band: Callable[[Path], SpectralFile]) ->
     bands = [open_band(path) for path in sorted(files, key=lambda path: natural_order(path.name))]
     for band in bands:
         if band.shape[2] != 1:
-            found = f"{band.path}: {band.shape[2]} bands; expected one band a file in {folder}"
             if (folder / "transforms.json").is_file():
-                found = (
+                raise CaptureError(
                     f"{folder}: its transforms.json names pictures as views, which are no bands of one image; give one "
                     "of them, or read all with unmix-process nerfstudio"
                 )
-            raise CaptureError(found)
+            raise CaptureError(f"{band.path}: {band.shape[2]} bands; expected one band a file in {folder}")
         if (model := radiometric_model(band)) is not None:
             raise CaptureError(
                 f"{band.path}: of one lens of a {model.maker} camera, with a calibration of its own, and bands of "

@@ -283,9 +283,8 @@ def _has_corner_normals(path: Path) -> bool:
         if found := _CORNER_0.search(text):
             line = found[0].decode("ascii", "replace").strip()
             raise SceneError(f"{path}: '{line}' names vertex 0; an OBJ counts from 1: export the mesh again")
-        if (
-            text[:4] == b"\xef\xbb\xbfv"
-        ):  # by which trimesh loses the first vertex, and all faces move on by one
+        # By the mark trimesh loses the first vertex, and all faces move on by one.
+        if text[:4] == b"\xef\xbb\xbfv":
             raise SceneError(f"{path}: begins with a byte order mark; save it as UTF-8 without one")
         return text.find(b"\nvn ") >= 0
 

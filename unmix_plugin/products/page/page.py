@@ -41,7 +41,7 @@ from unmix_plugin.products.scene_products import Page
 from unmix_plugin.products.views import draw_abundances, draw_segmentation
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.colour.conversion import describe_colour, rgb_matrix
-from unmix_plugin.spectral.maps.indices import NAMED_INDICES, available_indices, named_formula
+from unmix_plugin.spectral.maps.indices import NAMED_INDICES, named_formula
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.measured_surface import MeasuredSurface
 from unmix_plugin.trained.run_materials import endmember_colours, relit
@@ -264,9 +264,9 @@ def _spectral_facts(materials: Materials | None, recorded: Sequence[float] | Non
         "colour": describe_colour(bands),
         "lights": lights,
         "indices": [
-            {"name": name, "formula": named_formula(name, bands), "title": NAMED_INDICES[name].title}
-            | {"range": NAMED_INDICES[name].usual_range}
-            for name in available_indices(bands)
+            {"name": name, "formula": formula, "title": named.title, "range": named.usual_range}
+            for name, named in NAMED_INDICES.items()
+            if (formula := named_formula(name, bands))
         ],
         "colour_map": _colour_map(),
     }

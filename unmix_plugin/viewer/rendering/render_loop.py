@@ -105,9 +105,8 @@ class RenderLoop:
             self._changed.notify_all()
         if self._thread.is_alive():
             self._thread.join(_JOIN_S)
-        with (
-            self._changed
-        ):  # a thread in native code when the interpreter ends takes the process down with it
+        # A thread in native code when the interpreter ends takes the process down with it.
+        with self._changed:
             self._changed.wait_for(lambda: self._num_blocks == 0, _JOIN_S)
 
     def add(self, view: View) -> None:
