@@ -2,6 +2,7 @@
 
 import html
 import math
+import os
 import re
 import threading
 
@@ -170,7 +171,7 @@ def test_two_clicks_and_a_distance_set_the_scale_that_commands_read(viewer):
         page.wait_for_notice("the distance is 0 m")
         assert not (run.path / "measures.json").exists()
         page.set("distance (m)", 0.05)
-        in_the_way = run.path / ".measures.json.tmp"
+        in_the_way = run.path / f".measures.json.{os.getpid()}.tmp"
         in_the_way.mkdir()
         page.set("set scale")
         page.wait_for_notice("can't write")

@@ -3,6 +3,7 @@
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
 from pathlib import Path
@@ -223,7 +224,7 @@ def test_a_link_that_leads_out_of_the_folder_is_refused(trained, name, tmp_path)
 def test_a_link_in_the_temporarys_place_is_not_followed(tmp_path, stream):
     victim = tmp_path / "victim"
     victim.write_text("precious")
-    (tmp_path / ".out.tmp").symlink_to(victim)
+    (tmp_path / f".out.{os.getpid()}.tmp").symlink_to(victim)
     if stream:
         with whole_file(tmp_path / "out") as temporary:
             temporary.write_bytes(b"new")
@@ -232,6 +233,19 @@ def test_a_link_in_the_temporarys_place_is_not_followed(tmp_path, stream):
     assert victim.read_text() == "precious"
     assert (tmp_path / "out").read_bytes() == b"new"
     assert not (tmp_path / "out").is_symlink()
+
+
+def test_of_two_processes_that_write_a_file_at_once_each_writes_it_whole(tmp_path, monkeypatch):
+    with ExitStack() as later:
+        with whole_file(tmp_path / "out") as ours:
+            ours.write_bytes(b"ours")
+            monkeypatch.setattr(os, "getpid", lambda: 1)
+            theirs = later.enter_context(whole_file(tmp_path / "out"))
+            theirs.write_bytes(b"theirs, ha")
+        assert (tmp_path / "out").read_bytes() == b"ours"
+        theirs.write_bytes(b"theirs")
+    assert (tmp_path / "out").read_bytes() == b"theirs"
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
 CHANGES: dict[str, Callable[[dict[str, Any]], object]] = {

@@ -71,7 +71,8 @@ def safe_name(name: str, unfit: str = NOT_PLAIN, fallback: str = "unnamed") -> s
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Context that gives a temporary name in the folder of `path`, which is made; nothing has that name yet.
+    """Context that gives a temporary name in the folder of `path`, which is made; nothing has that name yet, nor does
+    another process that writes the same file take it.
 
     At the end of the block the file under that name is forced to disk and becomes `path`. If the block fails, nothing
     is left of it and `path` is as it was.
@@ -80,7 +81,7 @@ def whole_file(path: Path) -> Iterator[Path]:
         RunError: the folder can't be made, or the file can't get its name.
     """
     make_folder(path.parent)
-    temporary = path.with_name(f".{path.name}.tmp")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         with write_errors_as(path):
             temporary.unlink(missing_ok=True)  # a link that lies there would lead the writer elsewhere
