@@ -188,6 +188,10 @@ def as_process(command, *, redirect="", **environment):
 @pytest.mark.parametrize("redirect", [">&-", "2>&-", ">&- 2>&-", "<&- >&- 2>&-"])
 def test_closed_streams_change_no_exit_code(redirect):
     assert as_process("lambda _: print('line')", redirect=redirect).returncode == 0
+    numbers = (
+        "lambda _: [__import__('os').fstat(number) for number in range(3)]"  # native code writes to them
+    )
+    assert as_process(numbers, redirect=redirect).returncode == 0
     failing = "lambda _: (_ for _ in ()).throw(__import__('unmix_plugin.errors').errors.SceneError('none'))"
     assert as_process(failing, redirect=redirect).returncode == 2
 

@@ -89,14 +89,15 @@ def _at_home(word: str) -> str:
 def _ready_streams() -> None:
     """Streams that take any text: names of files need not be text, and a terminal may know no more than ASCII.
 
-    A stream that was closed before the command began, as by `>&-`, takes what is written and drops it.
+    A stream that was closed before the command began, as by `>&-`, takes what is written and drops it. They are opened
+    in the order of their numbers, which a file of ours would have otherwise, and what native code says in it.
     """
     codecs.register_error(_AS_BYTES, _as_bytes)
-    for name in ("stdout", "stderr"):
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         stream = getattr(sys, name)
         if stream is None:
-            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: PTH123, SIM115 - for the whole process
-        elif isinstance(stream, io.TextIOWrapper):
+            setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))  # noqa: PTH123, SIM115 - for the whole process
+        elif name != "stdin" and isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors=_AS_BYTES)
 
 
