@@ -56,6 +56,13 @@ def test_an_edit_leaves_the_scene_as_it_was_and_its_coefficients_serve_where_geo
         assert_close(view["spectral"], shown["spectral"])
 
 
+def test_names_can_be_exchanged():
+    renames = [
+        f"rename: {{endmember: {number}, name: {name}}}" for number, name in ((0, "green"), (1, "red"))
+    ]
+    assert edited(named_scene(), *renames).materials.names == ("green", "red", "blue")
+
+
 @pytest.mark.parametrize("specular", ["none", "dictionary", "full"])
 def test_swapped_endmembers_exchange_their_looks_and_twice_render_the_original(specular):
     scene = lit_scene(specular=specular)
@@ -232,7 +239,8 @@ REFUSED = [
     ([REPLACE % "red"] * 2, "'red' can't be replaced: edits.yml, line 2 (replace) has it replaced already"),
     ([RETINT] * 2, "'red' can't be retinted: edits.yml, line 2 (retint) has it retinted already"),
     ([COLOURED % "", COLOURED % "endmember: 2, "], "(gloss) has it given a colour of gloss already"),
-    (["rename: {endmember: 1, name: red}"], "line 2 (rename): endmember 0 is called 'red' already"),
+    (["rename: {endmember: 1, name: red}"], "line 2 (rename): endmembers 0 and 1 would both be called 'red'"),
+    (["rename: {endmember: 1, name: red}", "swap: [red, 2]"], "two endmembers are called 'red' here"),
     ([REPLACE % "rde"], "no 'ColorChecker/rde'; nearest: ColorChecker/red"),
     (["gloss: {scale: 2}"], "no view-dependent part"),
 ]

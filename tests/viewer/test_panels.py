@@ -332,7 +332,7 @@ def test_a_name_is_typed_letter_by_letter_as_one_edit_and_one_that_is_taken_goes
     page.wait_until(lambda: recipe["value"] == NO_EDITS and name["value"] == "endmember_0")
     assert page.notices == []
     page.set("name", "endmember_1")
-    page.wait_for_notice("is called 'endmember_1' already")
+    page.wait_for_notice("would both be called 'endmember_1'")
     assert recipe["value"] == NO_EDITS
     page.wait_until(lambda: name["value"] == "endmember_0")
 

@@ -171,7 +171,7 @@ def state_linear(
     if len(found) > 1:
         warnings.append(f"{found[0].evidence} is applied, not {found[1].evidence}")
     key = named.get(_DIVISOR, "")
-    factors = _factors(key, entries.get(key, "1"), warnings)
+    factors = _factors(path, key, entries.get(key, "1"))
     if set(factors) == {1.0}:
         return found[0] if found else None
     # An offset above 1 is one of stored numbers, not of reflectances, to which the factor leads.
@@ -192,18 +192,23 @@ def _floats(path: Path, what: str, value: Any) -> list[float]:
         raise CaptureError(f"{path}: {what} has {found}; expected numbers, one a band") from None
 
 
-def _factors(key: str, value: Any, warnings: list[str]) -> list[float]:
-    """A number above 0 with a comment behind it, or one a band; 1 with a warning for anything else."""
+def _factors(path: Path, key: str, value: Any) -> list[float]:
+    """A number of 1 or more with a comment behind it, or one a band.
+
+    Raises:
+        CaptureError: anything else: without it, or with its inverse, all numbers would be false.
+    """
+    items = [value.partition(";")[0]] if isinstance(value, str) else listed(value)
     try:
-        factors = [
-            float(item) for item in ([value.partition(";")[0]] if isinstance(value, str) else listed(value))
-        ]
+        factors = [float(item) for item in items]
     except ValueError:
         factors = []
-    if factors and all(0 < factor < np.inf for factor in factors):
+    if factors and all(1 <= factor < np.inf for factor in factors):
         return factors
-    warnings.append(f"'{key}' is {value} and is left out; expected a number above 0")
-    return [1.0]
+    raise CaptureError(
+        f"{path}: '{key}' is {value}; expected the stored number of full reflectance, 1 or more: correct it or "
+        "take it out"
+    )
 
 
 def check_bands(stated: StatedBands, num_bands: int, warnings: list[str]) -> BandTable:

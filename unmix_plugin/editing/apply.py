@@ -297,9 +297,6 @@ def _isolate(state: MaterialState, edit: Isolate, where: str) -> None:
 def _rename(state: MaterialState, edit: Rename, where: str) -> None:
     index = state.index_of(edit.endmember)
     state.note(_NAMED, index, where)
-    other = state.names.index(edit.name) if edit.name in state.names else index
-    if other != index:
-        raise ConfigError(f"endmember {other} is called {edit.name!r} already; names must differ")
     state.names[index] = edit.name
 
 
@@ -358,6 +355,7 @@ def edit_scene(
             _HANDLERS[type(operation)](state, operation, where)
         except UnmixError as error:
             raise ConfigError(f"{where}: {error}") from error
+    _require_names_that_differ(state, recipe)
     factors, told = light_factors(scene, recipe)
     materials = replace(
         scene.materials,
@@ -376,6 +374,17 @@ def edit_scene(
     assumed = assumption_of_light(scene, recipe)
     notes = [*scene.notes, *([] if assumed is None else [assumed]), *state.notes, *told]
     return replace(scene, field=_field(scene, state), materials=materials, notes=tuple(notes))
+
+
+def _require_names_that_differ(state: MaterialState, recipe: Recipe) -> None:
+    """Names may be exchanged: only those that all edits together leave have to differ."""
+    for position, edit in reversed(list(enumerate(recipe.operations))):
+        if isinstance(edit, Rename) and state.names.count(edit.name) > 1:
+            first, second = (index for index, name in enumerate(state.names) if name == edit.name)
+            raise ConfigError(
+                f"{recipe.where(position)}: endmembers {first} and {second} would both be called {edit.name!r}; names "
+                "must differ"
+            )
 
 
 def _field(scene: TrainedScene, state: MaterialState) -> CoefficientField:

@@ -184,12 +184,14 @@ class MaterialState:
         """The number of an endmember.
 
         Raises:
-            ConfigError: there is none of that name or number; the message has the nearest names.
+            ConfigError: there is none of that name or number, with the nearest names; or two of that name.
         """
         if isinstance(endmember, int):
             if 0 <= endmember < len(self.names):
                 return endmember
             raise ConfigError(f"there is no endmember {endmember}; the run has {self._listed()}")
+        if self.names.count(endmember) > 1:
+            raise ConfigError(f"two endmembers are called {endmember!r} here; say which by its number")
         if endmember in self.names:
             return self.names.index(endmember)
         hint = did_you_mean(endmember, self.names, form="{} ")

@@ -107,7 +107,6 @@ SAID: dict[str, dict[str, Any]] = {
     "band names = {450 nm, 460 nm, red, 480 nm}": {"nm": None},
     "data ignore value = -9999 ; none measured": {"no_data": (-9999,)},
     "data ignore value = {-9999, 0}": {"no_data": (-9999, 0), "warnings": ()},
-    "reflectance scale factor = {1, 2, 3, 4}": {"linear": None, "warning": "is 1, 2, 3, 4 and is left out"},
     "data ignore value = unset": {"warning": "'data ignore value' is unset, no number: not used"},
     "sensor type = a\nsensor type = b\nwavelength = {400, 500, 600, 700}": {"nm": NM},
     "; by hand\n\nscale factor: 10000": {
@@ -206,6 +205,9 @@ def test_headers_in_the_encodings_and_lists_of_other_programs(tmp_path, encoding
         ({"data gain values": "{1, 2, x, 1}"}, "'data gain values' has 'x'"),
         ({"data gain values": "{1, 0, 2, 1}"}, "gains from 0 to 2; expected finite numbers above 0"),
         ({"data gain values": "2\nreflectance scale factor = 10000"}, "it is unclear which the numbers need"),
+        ({"reflectance scale factor": "10,000"}, "is 10,000; expected the stored number of full reflectance"),
+        ({"reflectance scale factor": "{1, 2, 3, 4}"}, "is 1, 2, 3, 4; expected"),
+        ({"reflectance scale factor": "0.0001"}, "is 0.0001; expected .* 1 or more"),
         ({"data offset values": "-1000\nreflectance scale factor = 10000"}, "an offset above 1"),
         ("BYTEORDER I\nNROWS 540\n", "header of an ESRI"),
         (bytes(range(256)).decode("latin-1"), "no ENVI header: its first line is not 'ENVI'.* Convert the"),
