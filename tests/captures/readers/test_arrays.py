@@ -122,6 +122,15 @@ HDF5: list[tuple[dict[str, Any], dict[str, Any]]] = [
         {"nm": NM, "scale": 10000, "no_data": (-9999,), "bad": [1], "exposure_s": 2e-5}
         | {"dataset": "site/reflectance"},
     ),
+    *(  # a list may be a text, or one text a number
+        ({"cube": CUBE, "/": (None, {"wavelengths": text})}, {"nm": NM})
+        for text in (
+            ", ".join(map(str, NM)),
+            str(np.array(NM)),
+            [str(nm) for nm in NM],
+            np.bytes_(list(map(str, NM))),
+        )
+    ),
     ({"run/cube": (CUBE, {"wavelengths": NM}), "run": (None, {"Scale Factor": 0.5})}, {"nm": NM, "scale": 2}),
     (  # what is nearest to an image counts, and units are those of their own list
         {

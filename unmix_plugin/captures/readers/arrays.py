@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from math import prod
 from pathlib import Path
@@ -20,6 +21,7 @@ from unmix_plugin.captures.header_values import (
     counts_bands,
     exposure_facts,
     is_exposure,
+    listed,
     plain_names,
     says_bands,
     state_bands,
@@ -279,11 +281,24 @@ def _entries(arrays: Sequence[FoundArray], image: FoundArray) -> dict[str, Any]:
     entries = {key: value for key, value in attributes.items() if not says_bands(key.lower())}
     entries |= _lists_beside(arrays, image)
     for key in sorted(attributes, key=words_apart):
-        values = np.atleast_1d(attributes[key])
+        values = np.atleast_1d(
+            _numbers_in_text(attributes[key]) if says_bands(key.lower()) else attributes[key]
+        )
         kinds = _NUMBERS + "b" * bool(GOOD.fullmatch(key.lower()))
         if values.ndim == 1 and values.dtype.kind in kinds and len(values) in image.shape:
             entries.setdefault(key, values)
     return entries
+
+
+def _numbers_in_text(value: Any) -> Any:
+    """A list of numbers that is written as a text, or as one text a number; anything else as it is."""
+    if isinstance(value, str) or np.asarray(value).dtype.kind in "OSU":
+        texts = [
+            text.decode("utf-8", "replace") if isinstance(text, bytes) else text for text in listed(value)
+        ]
+        with suppress(TypeError, ValueError):
+            return [float(text) for text in texts]
+    return value
 
 
 def _lists_beside(arrays: Sequence[FoundArray], image: FoundArray) -> dict[str, Any]:
