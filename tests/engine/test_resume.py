@@ -86,6 +86,9 @@ def test_a_finished_run_resumed_is_left_as_it_is_and_goes_on_to_a_longer_limit(s
     finished(replace(load_config(first.run.path), max_num_iterations=15))
     assert newest(first.run.path).step == 15
     assert load_config(first.run.path).max_num_iterations == 15
+    assert first.run.training_path.exists()
+    stop_at(replace(load_config(first.run.path), max_num_iterations=20), 17)
+    assert not first.run.training_path.exists()  # it told of a training that is no longer the run's
 
 
 @pytest.mark.parametrize(("step", "saved", "said"), [(6, 4, None), (2, None, "no checkpoint")])

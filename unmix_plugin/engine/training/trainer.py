@@ -135,6 +135,7 @@ class Trainer:
             with self.control.device.training_turn():
                 self.warm_up()
             self.steps.begin(self.step)
+            self.run.training_path.unlink(missing_ok=True)  # of the training that this one goes on with
             with stop_signals() as signals, ProgressDisplay(self.console) as display, self.control.running():
                 self._loop(signals, display)
         except KeyboardInterrupt as error:
