@@ -78,6 +78,15 @@ def test_headers_called_x_bil_hdr_belong_to_the_view_x_its_references_and_its_pi
         find_cubes(made.root, PLAIN)
 
 
+@pytest.mark.parametrize("name", ["tree/212/capture/212", "flat/Bl\u00e4tter (1) von oben"])
+def test_a_picture_belongs_to_the_cube_beside_it_whatever_its_name_and_in_a_tree_too(tmp_path, name):
+    write_tree(tmp_path / "tree")
+    (tmp_path / "flat").mkdir()
+    path = write_cube(tmp_path, name, counts(7)).with_suffix(".png")
+    path.touch()
+    assert find_cubes(tmp_path / name.split("/")[0], PLAIN).views[0].picture == path
+
+
 def test_trees_of_several_days_may_have_the_same_names_and_references_above_them_are_named(tmp_path):
     for day in ("monday", "tuesday"):
         write_tree(tmp_path / day)

@@ -66,20 +66,19 @@ def find_cubes(root: Path, options: ReadOptions) -> Capture:
     excluded = {path.resolve() for path in options.exclude}
     files = [path for path in _visible_files(root) if path.resolve() not in excluded]
     plain = {path.stem: path for path in files if path.suffix.lower() in _PICTURE_SUFFIXES}
-    pictures = {_stem(path): path for path in plain.values()}
     cubes = _cubes_among(files)
     if any(not _is_reference(path, ()) for path in cubes):
-        return _capture_of_groups(root, {root: cubes}, pictures, options)
+        return _capture_of_groups(root, {root: cubes}, options)
     folders = _band_folders(root, excluded)
     if not folders and (deeper := _cubes_below(root, excluded)):  # references may lie in the folder itself
-        return _capture_of_groups(root, deeper, {}, options)
+        return _capture_of_groups(root, deeper, options)
     shown = folders or [path for path in plain.values() if not _is_reference(path, ())]
     if not shown:
         kinds = ", ".join(sorted(_CUBE_SUFFIXES | _PICTURE_SUFFIXES))
         raise CaptureError(
             f"{root} holds no cubes; expected one file a view ({kinds}), or one folder of band files a view"
         )
-    views = _open_views(_names(shown), shown, [{}] * len(shown), pictures if folders else {}, options)
+    views = _open_views(_names(shown), shown, [{}] * len(shown), files if folders else [], options)
     return Capture("cubes", root, views)
 
 
@@ -87,22 +86,22 @@ def _open_views(
     names: Sequence[str],
     paths: Sequence[Path],
     references: Sequence[dict[str, Path]],
-    pictures: dict[str, Path],
+    files: Sequence[Path],
     options: ReadOptions,
 ) -> tuple[CaptureView, ...]:
-    """Views in the order of their names, each with references of its own by their kind."""
-    views = []
+    """Views in the order of their names, each with references of its own by their kind, and the picture among the files
+    that lies beside it."""
+    shown = [path for path in files if path.suffix.lower() in _PICTURE_SUFFIXES]
+    pictures, views = {path.with_name(_stem(path)): path for path in shown}, []
     for name, path, own in zip(names, paths, references, strict=True):
         plain = replace(options, wavelengths_nm=None)
         opened = {kind: open_spectral_file(reference, plain) for kind, reference in own.items()}
-        view = CaptureView(name, _open(path, options), picture=pictures.get(name))
+        view = CaptureView(name, _open(path, options), picture=pictures.get(path.with_name(_stem(path))))
         views.append(replace(view, **opened))
     return tuple(sorted(views, key=lambda view: natural_order(view.name)))
 
 
-def _capture_of_groups(
-    root: Path, folders: dict[Path, list[Path]], pictures: dict[str, Path], options: ReadOptions
-) -> Capture:
+def _capture_of_groups(root: Path, folders: dict[Path, list[Path]], options: ReadOptions) -> Capture:
     """Views of one folder or of a tree, with the references that were taken for each."""
     groups: dict[tuple[Path, str], dict[str, Path]] = defaultdict(dict)
     left_out: list[Path] = []
@@ -128,7 +127,8 @@ def _capture_of_groups(
         {reference: group[reference] for reference in _OWN if reference in group and kind == "cube"}
         for group, kind in zip(complete.values(), kinds, strict=True)
     ]
-    views = _open_views(names, paths, own, pictures, options)
+    there = [path for folder in folders for path in _visible_files(folder)]
+    views = _open_views(names, paths, own, there, options)
     counts = Counter(reference for references in own for reference in references)
     notes = [
         f"{counts[kind]} of {len(views)} views have a {what}, which is used unless {flag} names another"
@@ -140,7 +140,6 @@ def _capture_of_groups(
     if left_out:
         named = name_some([path.name for path in left_out])
         notes.append(f"left out, as named like references: {named}; use one with --white or --dark")
-    there = [path for folder in folders for path in _visible_files(folder)]
     lost = [path.name for path in there if path.suffix.lower() in _NUMBERS and header_beside(path) is None]
     warnings = (f"left out, as no header beside them says what they hold: {name_some(lost)}",) if lost else ()
     return Capture("cubes", root, views, notes=tuple(notes), warnings=warnings)
