@@ -36,6 +36,13 @@ def with_a_faint_seam(view: int, _: np.random.Generator) -> np.ndarray:
     return np.where(40 + 2 * view > ROWS, wall, 0.45)[..., None] * COLOUR
 
 
+def with_a_round_floor(view: int, _: np.random.Generator) -> np.ndarray:
+    """A wall around a floor, which two views show between their lower corners alone."""
+    width = 45 if view < 2 else 400
+    floor = np.hypot((COLUMNS - 60) / width, (ROWS - 100) / 40) < 1
+    return np.where(floor, 0.5, 0.3)[..., None] * COLOUR
+
+
 BACKDROPS: dict[str, Light] = {
     "black": grey(0.02),
     "grey": grey(0.2),
@@ -47,6 +54,7 @@ BACKDROPS: dict[str, Light] = {
     ),
     "a shaded wall and floor": shaded_with_a_seam,
     "a wall that is hardly darker than the floor": with_a_faint_seam,
+    "a wall around a round floor": with_a_round_floor,
 }
 
 
@@ -165,14 +173,17 @@ def test_a_view_that_matter_fills_keeps_all_of_it():
 
 @pytest.mark.parametrize("is_plain", [False, True])
 def test_matter_that_reaches_the_border_stays(is_plain: bool):
-    """A dark pot that the picture's lower edge cuts off is no second surface, nor are the dark leaves above it."""
+    """A dark pot that the picture's lower edge cuts off is no second surface, even where it reaches a corner, nor are
+    the dark leaves above it."""
     images, _ = pictures(BACKDROPS["white"])
     texture = textured(np.random.default_rng(4), 0.3, 0.6)
     stand = (0.01 * texture if is_plain else texture).astype(np.float32)
-    for image in images:
-        image[50:, 40:70] = stand[50:, 40:70]
-    _, seen = seen_in(images[0], images)
-    assert not seen.shown[50:, 41:69].any()
+    for view, image in enumerate(images):
+        left = 0 if view < 2 else 40
+        image[50:, left:70] = stand[50:, left:70]
+    for image in images[1:3]:
+        _, seen = seen_in(image, images)
+        assert not seen.shown[50:, 41:69].any()
 
 
 def test_pixels_without_a_measurement_are_not_the_backdrop():

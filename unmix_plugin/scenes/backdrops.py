@@ -45,6 +45,8 @@ _LEAST_EXPLAINED, _LEAST_IN_A_VIEW = 0.8, 0.5
 """Share of the border that a backdrop reaches: in the median, and in most views."""
 _MOST_VIEWS = 0.8
 """Share of the views that this holds for."""
+_LEAST_CORNERS = 0.6
+"""Share of its surfaces that show in a corner of their view."""
 _LEAST_SHARE = 0.1
 """Of the pixels; less than that is not worth a mask."""
 _MOST_SHARE, _ALL = 0.9, 0.995
@@ -190,10 +192,15 @@ def judge_backdrop(
     levels = np.array([each.level for view in fitted for each in view.surfaces], np.float32)
     if not len(levels):
         return None
-    # Alike are surfaces that most views have one like.
+    # Alike are surfaces that most views have one like. A seam leaves corners on either side, in many views if not in
+    # all; what an edge of the pictures cuts off between two corners, such as the foot of an object, stands before it.
     owners = np.array([index for index, view in enumerate(fitted) for _ in view.surfaces])
     near = norm(levels[:, None] - levels[None]) < _MOST_UNLIKE * brightest
-    supported = [len(set(owners[row])) >= _MOST_VIEWS * len(images) for row in near]
+    has_corner = np.array([each.has_corner for view in fitted for each in view.surfaces])
+    supported = [
+        len(set(owners[row])) >= _MOST_VIEWS * len(images) and has_corner[row].mean() >= _LEAST_CORNERS
+        for row in near
+    ]
     found = Backdrop(basis, stripes, brightest, levels[supported], np.zeros(basis.shape[0], np.float32))
     explained, shares, distances, spectra = [], [], [], []
     for image, view, mask in zip(images, fitted, known, strict=True):

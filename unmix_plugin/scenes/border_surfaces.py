@@ -58,6 +58,8 @@ class _Surface:
     """Distance up to which a pixel belongs to it."""
     level: Float32[np.ndarray, " k"]
     """Median features of its pixels."""
+    has_corner: bool = False
+    """Whether it shows in a corner of the picture."""
 
 
 @dataclass(frozen=True)
@@ -196,22 +198,21 @@ def fit_surfaces(features: Features, known: Mask, brightest: float) -> FittedVie
         parts = parts_of(alike)
         members = np.flatnonzero(np.isin(parts, parts[at_border]) & alike)
         unexplained = border[~alike.ravel()[border]]
-    return FittedView(features, _of_corners(surfaces, features), farthest, known)
+    if surfaces:
+        _note_corners(surfaces, features)
+    return FittedView(features, surfaces, farthest, known)
 
 
-def _of_corners(surfaces: list[_Surface], features: Features) -> list[_Surface]:
-    """Of several surfaces those that show in most of a corner: a seam leaves one on either side, but what an edge of
-    the picture cuts off between two corners, such as the foot of an object, stands before the backdrop."""
-    if len(surfaces) < 2:
-        return surfaces
-    terms, has_corner = _terms(features.shape[:2]).reshape(*features.shape[:2], -1), [False] * len(surfaces)
+def _note_corners(surfaces: list[_Surface], features: Features) -> None:
+    """Note which surfaces show in most of a corner of the picture."""
+    terms = _terms(features.shape[:2]).reshape(*features.shape[:2], -1)
     rows, columns = (max(1, round(BORDER_SHARE * side)) for side in features.shape[:2])
     for corner in (np.s_[y, x] for y in np.s_[:rows, -rows:] for x in np.s_[:columns, -columns:]):
         seen, own = features[corner], terms[corner]
         away = np.array([norm(seen - own @ each.coefficients) / each.tolerance for each in surfaces])
         shares = ((away <= 1) & (away <= away.min(axis=0))).mean(axis=(1, 2))
-        has_corner = [has or share > 0.5 for has, share in zip(has_corner, shares.tolist(), strict=True)]
-    return [one for one, has in zip(surfaces, has_corner, strict=True) if has] or surfaces
+        for surface, share in zip(surfaces, shares.tolist(), strict=True):
+            surface.has_corner |= share > 0.5
 
 
 def _border_surfaces(
