@@ -117,6 +117,14 @@ def test_the_end_of_the_detector_is_a_plateau(top: int, facts, part, value: int,
     assert _find_saturation([file_of(counts, **facts)], np.arange(6))[0] == expected
 
 
+@pytest.mark.parametrize(("factor", "expected"), [(1.0, 4095.0), (1e-4, None), (-1.0, None)])
+@pytest.mark.parametrize("dtype", [np.float32, np.int32])
+def test_counts_end_where_the_detector_does_in_wider_numbers_too(dtype, factor: float, expected):
+    counts = GENERATOR.normal(2000, 900, (64, 64, 6)).clip(0, 4095).round()
+    found = _find_saturation([file_of((counts * factor).astype(dtype))], np.arange(6))[0]
+    assert found == expected
+
+
 def white_of(counts: np.ndarray, **facts):
     return open_reference(file_of(counts, **facts), "white reference", file_of(counts, **facts))
 

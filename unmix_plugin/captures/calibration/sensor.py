@@ -308,10 +308,10 @@ def sampled_rows(height: int) -> list[int]:
 def _find_saturation(files: Sequence[SpectralFile], bands: np.ndarray) -> tuple[float | None, str]:
     """The stored number at which a detector ends, from a plateau at the greatest one, and the evidence."""
     dtype = files[0].dtype
-    if dtype.kind not in "iu" or dtype.itemsize > 2:  # such numbers were processed
-        return None, f"none: the files hold {dtype.name}"
-    low = int(np.iinfo(dtype).min)
-    counts = np.zeros(np.iinfo(dtype).max - low + 1, dtype=np.int64)
+    is_wide = dtype.kind not in "iu" or dtype.itemsize > 2  # a detector's, or processed
+    limits = np.iinfo(np.uint16 if is_wide else dtype)
+    low, high = int(limits.min), int(limits.max)
+    counts = np.zeros(high - low + 1, dtype=np.int64)
     rows = sampled_rows(files[0].shape[0])
     parts = [file.read(slice(row, row + 1), bands)[0] for file, row in product(files[:_MOST_ALIKE], rows)]
     bands = bands[np.ptp(np.concatenate(parts), axis=0) > 0]
@@ -319,6 +319,8 @@ def _find_saturation(files: Sequence[SpectralFile], bands: np.ndarray) -> tuple[
         return None, "none: every band has one value only"
     for file, row in product(files, rows):
         stored = _stored_pixels(file, row, bands).ravel()
+        if is_wide and not ((stored >= 0) & (stored <= high) & (stored % 1 == 0)).all():
+            return None, f"none: not all numbers ({dtype.name}) are whole ones from 0 to {high}"
         counts += np.bincount(stored.astype(np.int64) - low, minlength=len(counts))
     top = int(np.flatnonzero(counts)[-1]) if counts.any() else 0
     below = counts[max(0, top - max(1, (top + low) // 50)) : top]
@@ -326,8 +328,10 @@ def _find_saturation(files: Sequence[SpectralFile], bands: np.ndarray) -> tuple[
     number, is_end = top + low, top + low in {2**bits - 1 for bits in _DETECTOR_BITS}
     if at_top >= _LEAST_AT_TOP and (at_top > _CROWDING * usual or is_end):
         return float(number), f"{at_top} sampled values are {number}, none is greater"
-    limit = float(np.iinfo(dtype).max)
-    return limit, f"no plateau below the end of {dtype.name}; the greatest sampled value is {number}"
+    said = f"the greatest sampled value is {number}"
+    if is_wide:
+        return None, f"none: no plateau in {dtype.name}; {said}"
+    return float(high), f"no plateau below the end of {dtype.name}; {said}"
 
 
 def _stored_pixels(file: SpectralFile, row: int, bands: BandIndex = slice(None)) -> Shaped[np.ndarray, "N b"]:
