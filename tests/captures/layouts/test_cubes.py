@@ -87,6 +87,15 @@ def test_a_picture_belongs_to_the_cube_beside_it_whatever_its_name_and_in_a_tree
     assert find_cubes(tmp_path / name.split("/")[0], PLAIN).views[0].picture == path
 
 
+@pytest.mark.parametrize(("folder", "own"), [("scene", "process.json"), ("scene.unfinished", "plan.json")])
+def test_a_scene_that_was_written_into_a_tree_is_no_part_of_it(tmp_path, folder, own):
+    write_tree(tmp_path)
+    (tmp_path / folder / "cubes").mkdir(parents=True)
+    (tmp_path / folder / own).touch()
+    np.save(tmp_path / folder / "cubes" / "212.npy", counts(7))
+    assert list(stems(tmp_path)) == NAMES
+
+
 def test_trees_of_several_days_may_have_the_same_names_and_references_above_them_are_named(tmp_path):
     for day in ("monday", "tuesday"):
         write_tree(tmp_path / day)

@@ -58,6 +58,8 @@ _RESULTS = "results"
 _STEPS = ("capture", "captures", "results", "raw")
 """Folders below that of a view, which don't name it."""
 _DEEPEST = 5
+_OF_SCENES = ("process.json", "plan.json")
+"""In a scene that this command made, or has not finished: its cubes are no views."""
 
 
 def find_cubes(root: Path, options: ReadOptions) -> Capture:
@@ -206,7 +208,11 @@ def _cubes_below(root: Path, excluded: set[Path]) -> dict[Path, list[Path]]:
     found: dict[Path, list[Path]] = {}
     for parent, folders, _ in os.walk(root):
         folder = Path(parent)
-        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        folders[:] = sorted(
+            name
+            for name in folders
+            if not name.startswith(".") and not any((folder / name / own).is_file() for own in _OF_SCENES)
+        )
         if len(folder.relative_to(root).parts) == _DEEPEST:
             folders.clear()
         cubes = _cubes_among([path for path in _visible_files(folder) if path.resolve() not in excluded])
