@@ -73,6 +73,11 @@ def test_a_view_marks_what_it_sees_and_not_what_is_behind(surface):
     patch = surface.measure(InView.of_mask(CAMERA, polygon_mask(middle, (40, 40))), "patch")
     pixel = (3 - RADIUS) / float(CAMERA.focal_px[0, 0]) / FRAME.scale
     assert patch.area == pytest.approx((8 * pixel) ** 2, rel=0.05)
+    # Finer pixels than the surface is known to lose nothing of it.
+    fine, corners = CAMERA.resized(1280, 1280), [(32 * x, 32 * y) for x, y in middle]
+    rough = MeasuredSurface(SCENE, TriangleMesh(1.02 * surface.mesh.vertices, surface.mesh.faces))
+    same = rough.measure(InView.of_mask(fine, polygon_mask(corners, (1280, 1280))), "same")
+    assert same.area == pytest.approx(patch.area, rel=0.05)
     corner = InView.of_mask(CAMERA, polygon_mask([(0.0, 0.0), (3.0, 0.0), (0.0, 3.0)], (40, 40)))
     with pytest.raises(ConfigError, match="has nothing of the surface"):
         surface.measure(corner, "corner")

@@ -135,5 +135,7 @@ def points_in(
         rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
         height, width = int(rows[-1] - rows[0]) + 1, int(columns[-1] - columns[0]) + 1
         part = camera.crop(int(columns[0]), int(rows[0]), width, height)
-        inside[inside.clone()] = SeenSurface(scene, width * height, [part]).shows(positions[inside])
+        # Pages and views from near have pixels far smaller than the surface is known.
+        seen = SeenSurface(scene, width * height, [part])
+        inside[inside.clone()] = seen.shows(positions[inside], scene.pixel_size)
     return inside.numpy()

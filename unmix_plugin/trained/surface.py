@@ -121,9 +121,10 @@ class SeenSurface:
         needed = min(2, len(self._views))
         return points.select((confirmed >= needed) & (2 * seen_through <= confirmed))
 
-    def shows(self, positions: Float[Tensor, "P 3"]) -> Bool[Tensor, " P"]:
-        """Which points lie on what the cameras see."""
-        confirmed, seen_through = self._votes(positions)
+    def shows(self, positions: Float[Tensor, "P 3"], tolerance: float = 0.0) -> Bool[Tensor, " P"]:
+        """Which points lie on what the cameras see, to `_TOLERANCE_PX` or, where that is more, to a distance in model
+        units."""
+        confirmed, seen_through = self._votes(positions, tolerance)
         return (confirmed >= 1) & (seen_through <= confirmed)
 
     def hides(self, positions: Float[Tensor, "P 3"]) -> Bool[Tensor, " P"]:
@@ -140,12 +141,14 @@ class SeenSurface:
             left = left[~in_sight]
         return hidden
 
-    def _votes(self, positions: Float[Tensor, "P 3"]) -> tuple[Int64[Tensor, " P"], Int64[Tensor, " P"]]:
+    def _votes(
+        self, positions: Float[Tensor, "P 3"], tolerance: float = 0.0
+    ) -> tuple[Int64[Tensor, " P"], Int64[Tensor, " P"]]:
         """How many cameras see something at each point, and how many see something only behind it."""
         confirmed = torch.zeros(len(positions), dtype=torch.int64)
         seen_through = torch.zeros_like(confirmed)
         for camera, distances in self._views:
-            inside, excess = _excess_px(camera, distances, positions)
+            inside, excess = _excess_px(camera, distances, positions, tolerance / _TOLERANCE_PX)
             confirmed[inside] += excess.abs() <= _TOLERANCE_PX
             seen_through[inside] += excess > _TOLERANCE_PX
         return confirmed, seen_through
@@ -160,14 +163,15 @@ def in_image(
 
 
 def _excess_px(
-    camera: Cameras, distances: Float[Tensor, "H W"], positions: Float[Tensor, "P 3"]
+    camera: Cameras, distances: Float[Tensor, "H W"], positions: Float[Tensor, "P 3"], least: float = 0.0
 ) -> tuple[Bool[Tensor, " P"], Float[Tensor, " inside"]]:
-    """Which points are in the image, and by how many pixels, as large as they are there, it sees farther than each."""
+    """Which points are in the image, and by how many pixels, as large as they are there and at least so many model
+    units, it sees farther than each."""
     inside, coords, depths = in_image(camera, positions)
     columns, rows = coords.long().unbind(-1)
     places = camera.poses_at(torch.zeros_like(rows), coords[:, 1])[:, :, 3]
     own = (positions[inside] - places).norm(dim=-1)
-    return inside, (distances[rows, columns] - own) * camera.focal_px[0].min() / depths
+    return inside, (distances[rows, columns] - own) / (depths / camera.focal_px[0].min()).clamp(min=least)
 
 
 @torch.no_grad()
