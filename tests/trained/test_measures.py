@@ -1,4 +1,5 @@
 import json
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from unittest.mock import MagicMock
 
@@ -12,6 +13,7 @@ from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.trained import measures
 from unmix_plugin.trained.protocol import Probe
+from unmix_plugin.trained.regions import Box
 from unmix_plugin.trained.run_views import RunView
 from unmix_plugin.trained.trained_scene import TrainedScene
 
@@ -72,6 +74,14 @@ def test_a_damaged_file_is_refused(tmp_path):
         (tmp_path / "measures.json").write_text(json.dumps({"format_version": RUN_FORMAT, "scale": scale}))
         with pytest.raises(RunError, match=r"measures\.json is damaged"):
             measures.read_measures(RunFolder(tmp_path))
+
+
+def test_changes_at_once_lose_nothing_of_each_other(tmp_path):
+    run, box = RunFolder(tmp_path), Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+    names = [f"part {number}" for number in range(8)]
+    with ThreadPoolExecutor(len(names)) as pool:
+        list(pool.map(lambda name: measures.keep_region(run, name, box), names))
+    assert sorted(measures.read_measures(run).regions) == names
 
 
 def test_a_scene_may_know_its_unit():

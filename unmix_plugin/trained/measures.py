@@ -7,7 +7,8 @@ The world is that of the scene's poses, in which probes and exports give positio
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from unmix_plugin.engine.runs.atomic_files import read_run_json, write_run_json
-from unmix_plugin.engine.runs.run_folder import RunFolder
+from unmix_plugin.engine.runs.run_folder import RunFolder, RunLock
 from unmix_plugin.errors import ConfigError, RunError, did_you_mean
 from unmix_plugin.scenes.placement import METRES_KEY, METRES_RANGE
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION
@@ -26,6 +27,7 @@ from unmix_plugin.trained.regions import MOST_REGIONS, Region, check_name, regio
 _LONGEST_TEXT = 200
 _DAMAGE = (AttributeError, LookupError, TypeError, ValueError, RuntimeError, OverflowError, ConfigError)
 """What reading a file that holds something else raises."""
+_LONGEST_CHANGE_S = 20.0
 _CENTIMETRES_FROM_M, _METRES_FROM_M = 0.01, 1.0
 
 
@@ -139,9 +141,20 @@ def _write_measures(run: RunFolder, measures: Measures) -> Path:
     return measures_path(run)
 
 
+@contextmanager
+def _changing(run: RunFolder) -> Iterator[Measures]:
+    """Context with what is kept, in which no other process or thread changes it."""
+    lock = RunLock(run.path / "measures.lock", "command or viewer", _LONGEST_CHANGE_S)
+    try:
+        yield read_measures(run)
+    finally:
+        lock.release()
+
+
 def keep_scale(run: RunFolder, scale: Scale) -> Path:
     """Set the scale of a run, in place of the one before; the file."""
-    return _write_measures(run, replace(read_measures(run), scale=scale))
+    with _changing(run) as measures:
+        return _write_measures(run, replace(measures, scale=scale))
 
 
 def keep_region(run: RunFolder, name: str, region: Region | None) -> Path:
@@ -150,16 +163,16 @@ def keep_region(run: RunFolder, name: str, region: Region | None) -> Path:
     Raises:
         ConfigError: the name can't be one, there are too many regions, or there is none to remove.
     """
-    measures = read_measures(run)
-    name = check_name(name, () if region is None else measures.regions)
-    if region is None:
-        measures.region(name)
-    regions = {key: kept for key, kept in measures.regions.items() if key != name}
-    if region is not None:
-        regions[name] = region
-    if len(regions) > MOST_REGIONS:
-        raise ConfigError(f"a run keeps at most {MOST_REGIONS} regions; remove one first")
-    return _write_measures(run, replace(measures, regions=regions))
+    with _changing(run) as measures:
+        name = check_name(name, () if region is None else measures.regions)
+        if region is None:
+            measures.region(name)
+        regions = {key: kept for key, kept in measures.regions.items() if key != name}
+        if region is not None:
+            regions[name] = region
+        if len(regions) > MOST_REGIONS:
+            raise ConfigError(f"a run keeps at most {MOST_REGIONS} regions; remove one first")
+        return _write_measures(run, replace(measures, regions=regions))
 
 
 def scale_between(first: Sequence[float], second: Sequence[float], distance_m: float) -> Scale:

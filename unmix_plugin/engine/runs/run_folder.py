@@ -136,10 +136,11 @@ def _refuse_links_out(root: Path) -> None:
 class RunLock:
     """Held from its making to `release`, or to the end of the process, however it ends."""
 
-    def __init__(self, path: Path, holder: str = "training") -> None:
-        """Take the lock; the same process may take it again. `holder` is what takes such locks. Raises RunError:
-        another process has it, or the file can't be made."""
-        self._lock = FileLock(path, timeout=0, is_singleton=True, thread_local=False)
+    def __init__(self, path: Path, holder: str = "training", wait_s: float = 0.0) -> None:
+        """Take the lock, after waiting up to `wait_s` for others to release it. Without a wait the same process may
+        take it again. `holder` is what takes such locks. Raises RunError: another one has it, or the file can't be
+        made."""
+        self._lock = FileLock(path, timeout=wait_s, is_singleton=wait_s == 0, thread_local=False)
         self._is_held = False
         try:
             self._lock.acquire()

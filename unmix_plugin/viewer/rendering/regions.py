@@ -25,8 +25,7 @@ class RunRegions:
 
     def __init__(self, maker: PictureMaker) -> None:
         self._maker, self._source = maker, maker.source
-        self._measuring, self._keeping = threading.Lock(), threading.Lock()
-        """Apart, since finding the surface takes minutes, in which regions are kept and removed all the same."""
+        self._measuring = threading.Lock()
         self._is_stopping = False
         self._surface: MeasuredSurface | None = None
         self._measured: dict[str, tuple[MeasuredRegion, MeasuredSurface]] = {}
@@ -62,8 +61,7 @@ class RunRegions:
     def keep(self, name: str, region: Region | None) -> None:
         """Keep a region with the run, in place of one of its name, None removes that; a ConfigError if the name can't
         be one, or there are too many."""
-        with self._keeping:
-            keep_region(self._source.run, name, region)
+        keep_region(self._source.run, name, region)
 
     def stop(self) -> None:
         """End what is measured, and refuse to measure from now on."""
