@@ -28,7 +28,7 @@ from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import illuminant_names, linear_to_srgb, rgb_matrix
 from unmix_plugin.trained.camera_files import read_camera_file
 from unmix_plugin.trained.measured_surface import MeasuredSurface
-from unmix_plugin.trained.measures import keep_region, read_measures
+from unmix_plugin.trained.measures import Scale, keep_region, keep_scale, read_measures
 from unmix_plugin.trained.model_scene import ModelScene
 from unmix_plugin.trained.regions import Box, InView
 from unmix_plugin.trained.run_views import recorded_views, world_frame
@@ -229,6 +229,7 @@ def test_a_region_is_drawn_named_kept_as_commands_read_it_and_removed(tmp_path):
         page.click(0.75, 0.7)
         page.wait_for_text("Corners: 2")
         page.set("keep the region")  # once more under its name
+        page.wait_for_notice("in place of the one before")
         page.wait_until(lambda: not np.array_equal(kept().mask(), mask))
         redrawn = area_of(kept())
         assert redrawn != pytest.approx(area, rel=0.01)
@@ -260,6 +261,13 @@ def test_a_region_kept_or_removed_elsewhere_is_listed_or_not_and_numbers_are_of_
         page.set("region", "far away")
         page.wait_for_notice("far away has nothing")
         assert " square units</td>" not in page.texts
+        page.set("region", "all of it")
+        page.wait_for_text(" square units</td>")
+        before = page.texts
+        keep_region(source.run, "all of it", Box((-5.0, -5.0, -5.0), (5.0, 5.0, 0.0)))
+        page.wait_until(lambda: " square units</td>" in page.texts and page.texts != before)
+        keep_scale(source.run, Scale(0.01, "known"))
+        page.wait_for_text(" cm²</td>", "1 unit is 0.01 m")
         keep_region(source.run, "all of it", None)
         page.wait_until(lambda: "all of it" not in page.props("region")["options"])
 

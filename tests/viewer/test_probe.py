@@ -98,5 +98,9 @@ def test_the_files_of_probes_hold_every_number(taken):
     assert rows[1][7:9] == ["radiance", ""]
     np.testing.assert_allclose([float(value) for value in rows[1][9:]], taken.found.abundances, atol=1e-5)
     np.testing.assert_allclose([float(value) for value in rows[1][1:4]], taken.world, rtol=1e-7)
+    renamed = replace(taken, materials=replace(odd, names=("e", "new", "a,b")))
+    rows = list(csv.reader(io.StringIO(_abundances_csv([taken, renamed]).decode())))
+    assert rows[0][9:] == ["a,b", 'c"d', "e", "new"]
+    assert rows[2][9:] == [rows[1][11], "", rows[1][9], rows[1][10]]
     rows = list(csv.reader(io.StringIO(_abundances_csv([taken], Scale(0.25, "known")).decode())))
     assert rows[1][4] == "0.25"

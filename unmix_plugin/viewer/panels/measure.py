@@ -37,7 +37,9 @@ class MeasurePanel:
             self._scale = gui.add_html("")
             self._metres = gui.add_number("distance (m)", 0.0, min=0.0, step=0.0001)
             session.add_button("set scale", self._set_scale)
+        self._changed_at = session.services.regions.changed_at
         session.guarded(self._show)()
+        session.on_tick.append(self._follow)
 
     def _take(self, camera: Cameras, place: tuple[float, float]) -> None:
         with self._session.services.maker.shown_turn(self._session.view.edit) as (_, shown):
@@ -49,8 +51,14 @@ class MeasurePanel:
         self._points = []
         self._show()
 
+    def _follow(self) -> None:
+        """Other pages and commands set the scale, too."""
+        if self._changed_at != (changed_at := self._session.services.regions.changed_at):
+            self._changed_at = changed_at
+            self._show()
+
     def _show(self) -> None:
-        """Show points, distance and scale; the scale is read anew, as other pages and commands set it too."""
+        """Show points, distance and scale."""
         session, scene = self._session, self._session.client.scene
         scale = session.services.source.scale
         self._scale.content = paragraph(describe_scale(scale))

@@ -116,11 +116,13 @@ def _abundances_csv(probes: Sequence[_ProbedPoint], scale: Scale | None = None) 
     training view measured in, what the spectra are, the light lit in place of the recorded one, abundances."""
     metres = "" if scale is None else f"{scale.metres_per_unit:.9g}"
     header = ["probe", "x", "y", "z", METRES_KEY, "material", "measured_in", "quantity", "light"]
-    rows = [[*header, *probes[0].materials.names]]
+    names = dict.fromkeys(name for one in probes for name in one.materials.names)  # renamed between probes
+    rows = [[*header, *names]]
     for one in probes:
         place = [str(one.number), *(f"{value:.9g}" for value in one.world), metres]
         what = [one.material, one.measured_in, one.materials.quantity, one.materials.light_name or ""]
-        rows.append([*place, *what, *(f"{value:.6g}" for value in one.found.abundances)])
+        shares = dict(zip(one.materials.names, one.found.abundances, strict=True))
+        rows.append([*place, *what, *(f"{shares[name]:.6g}" if name in shares else "" for name in names)])
     return csv_bytes(rows)
 
 

@@ -104,12 +104,13 @@ class RegionsPanel:
         if camera is None or len(outline) < 3:
             raise ConfigError("draw a region first: two corners of a box, or three or more of a polygon")
         region = InView.of_mask(camera, polygon_mask(outline, camera.size(0)))
+        before = ", in place of the one before" if name in regions.kept else ""
 
         def keep() -> None:
             regions.keep(name, region)
             self._forget()
             self._list(name)
-            self._session.say("region kept", f"{name}: kept with the run")
+            self._session.say("region kept", f"{name}: kept with the run{before}")
 
         self._measure(name, region, keep)
 
@@ -147,12 +148,11 @@ class RegionsPanel:
         self._show_chosen()
 
     def _follow(self) -> None:
-        """Other pages and commands keep and remove regions, too."""
+        """Other pages and commands keep and remove regions and set the scale, too."""
         changed_at = self._session.services.regions.changed_at
-        if changed_at != self._changed_at:
+        if changed_at != self._changed_at and not self._is_busy:
             self._changed_at = changed_at
-            if tuple(self._chosen.options) != self._choices:
-                self._list(str(self._chosen.value))
+            self._list(str(self._chosen.value))
 
     def _show_chosen(self) -> None:
         self._show(None)  # numbers of another region never stand under this name while it is measured
@@ -176,10 +176,8 @@ class RegionsPanel:
             return
         region, surface = found
         scene, materials = surface.scene, surface.scene.materials
-        rows = [("area", describe_area(region.area, session.services.source.scale))]
-        if session.view.edit.has_recipe:
-            rows.append(("of", "the run as it was trained, without edits"))
-        self._found.content = table(rows)
+        area = describe_area(region.area, session.services.source.scale)
+        self._found.content = table([("area", area), ("of", "the run as it was trained, without edits")])
         colours = session.colours_of(materials)
         self._bars.content = bars(zip(materials.names, region.abundances.tolist(), colours, strict=True))
         colour = [value / 255 for value in _COLOUR]
