@@ -183,6 +183,8 @@ def read_layout(header: Mapping[str, str]) -> EnviLayout:
     """
     if "library" in header.get("file type", "").lower():
         raise ValueError("the file is a library of spectra; expected an image")
+    if "classification" in header.get("file type", "").lower():
+        raise ValueError("the file holds numbers of classes ('file type'), which are no light")
     if _count(header, "file compression", default="0"):
         raise ValueError("the file of numbers is compressed ('file compression'); write it uncompressed")
     for key in ("major frame offsets", "minor frame offsets"):

@@ -191,6 +191,7 @@ def test_headers_in_the_encodings_and_lists_of_other_programs(tmp_path, encoding
         ({"byte order": "2"}, "'byte order' is 2; expected 0"),
         ({"header offset": "1.5"}, "'header offset' is 1.5"),
         ({"file compression": "1"}, "compressed"),
+        ({"file type": "ENVI Classification"}, "numbers of classes .* no light"),
         ({"file type": "ENVI Spectral Library"}, "library of spectra; expected an image"),
         ({"major frame offsets": "{0, 8}"}, "'major frame offsets' is 0, 8"),
         ({"lines": "6"}, "cut short: 280 bytes; cube.hdr promises 336"),
