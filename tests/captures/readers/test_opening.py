@@ -234,6 +234,20 @@ def test_every_xml_beside_an_image_is_read_or_said_not_to_describe_its_bands(
 
 
 @pytest.mark.parametrize(
+    "say",
+    [
+        lambda nm: {"Description": f"{nm} nm"},
+        lambda nm: {
+            "Metadata": f'<MDI key="wavelength">{nm / 1000}</MDI><MDI key="wavelength_units">um</MDI>'
+        },
+        lambda nm: {"Metadata": f'<MDI key="CENTRAL_WAVELENGTH_UM">{nm / 1000}</MDI>', "Scale": 0.5},
+    ],
+)
+def test_names_and_wavelengths_that_gdal_keeps_beside_an_image_are_read(tmp_path, say):
+    check_file(open_spectral_file(write_tiff(tmp_path, aux=pam(*map(say, THREE)))), nm=THREE, warnings=())
+
+
+@pytest.mark.parametrize(
     ("product", "level", "quantity"),
     [
         ("ENMAP01-____L2A-DT0000001867_20220724T104526Z_008_V010302_20230628T165614Z", None, "reflectance"),

@@ -183,6 +183,9 @@ def test_wavelengths_of_ome_and_of_pages_by_their_descriptions_labels_and_names(
         for plane, label in zip(PLANES, labels, strict=True):
             named.write(plane, metadata=None, extratags=[(285, "s", 0, f"filter {label}", True)])
             told.write(plane, metadata=None, description=f"filter {label}")
+    with tifffile.TiffWriter(tmp_path / "e.tif") as each:
+        for plane, nm in zip(PLANES, NM, strict=True):
+            each.write(plane, metadata=None, description=f"exposure = 20\nwavelength = {nm:g}")
     for path in sorted(tmp_path.iterdir()):
         check_file(open_spectral_file(path), nm=NM, values=CUBE)
 

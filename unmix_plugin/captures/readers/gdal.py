@@ -36,6 +36,7 @@ _OF_BANDS = {
     "wavelength": ("wavelengthCenterOfBand",),
     "fwhm": ("FWHMOfBand", "wavelengthWidthOfBand"),
     "no_data": ("NoDataValue",),
+    "band_name": ("Description",),
 }
 """What XML beside a file says of a band, by names in GDAL's, EnMAP's and DESIS's."""
 
@@ -132,12 +133,14 @@ def _with_xml(file: SpectralFile, found: Path, warnings: list[str]) -> SpectralF
         quantity = level and _QUANTITIES[level[1]]
     items = _items_of_bands(elements, first, num_bands)
     bands, of_all = file.bands, {name: texts for name, texts in items.items() if len(texts) == num_bands}
-    if bands.wavelengths_nm is None and "wavelength" in of_all:
-        stated = state_bands(gdal_entries(of_all) | {"wavelength_units": "nm"}, found.name)
+    unit = {} if found.name.endswith(".aux.xml") else {"wavelength_units": "nm"}
+    stated = state_bands(gdal_entries(of_all) | unit, found.name)
+    if bands.wavelengths_nm is None and (stated.centres or stated.names):
         table = check_bands(stated, num_bands, warnings)
         marks = [bad for bad in (table.bad, bands.bad) if bad is not None]
         bad = np.any(marks, axis=0) if marks else None
-        bands = BandTable(table.wavelengths_nm, table.evidence, table.fwhm_nm, bad, bands.names)
+        names = table.names if bands.names is None else bands.names
+        bands = BandTable(table.wavelengths_nm, table.evidence, table.fwhm_nm, bad, names)
     linear = file.linear or gdal_linear(file.path, items, num_bands, found.name, warnings)
     if linear is not None and quantity:
         linear = replace(linear, evidence=f"{linear.evidence} of {quantity}")
@@ -158,8 +161,10 @@ def _items_of_bands(elements: Iterable[Element], first: int, num_bands: int) -> 
     for element in elements:
         number = element.get("band") or element.get("number") or element.findtext("bandNumber") or 0
         band = int(number) - first
+        texts = {str(item.get("key")).lower(): item.text for item in element.iterfind("Metadata/MDI")}
         for name, tags in _OF_BANDS.items():
-            text = next(filter(None, map(element.findtext, tags)), None)
+            texts[name] = next(filter(None, map(element.findtext, tags)), texts.get(name))
+        for name, text in texts.items():
             if text and 0 <= band < num_bands:
                 found[name][band] = text.strip()
     return found

@@ -102,6 +102,8 @@ def open_tiff(path: Path, options: ReadOptions) -> SpectralFile:
         said = [state_bands(entries, "GDAL metadata")]
         said += [state_bands(_described(page), "image description") for page in (first, top)]
         from_pages = _from_pages(stack.pages, file.imagej_metadata or {})
+        of_page = len(stack.pages) > 1  # a description of one wavelength may be that of its page alone
+        said = [one for one in said if not (of_page and len(one.centres or ()) == 1)]
         stated = next((one for one in said if one.centres or one.names), from_pages)
         stack = _with_fill(stack, gdal_number(_text(first, _GDAL_NODATA)), warnings)
         on_map = any(tag in first.tags for tag in _GEO_TAGS)
