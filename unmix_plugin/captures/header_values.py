@@ -27,11 +27,11 @@ from unmix_plugin.spectral.bands import are_band_numbers, nm_per_unit
 
 _CENTRES = re.compile(
     r"list_cw_[^_]*|bands|"
-    r"((band|cent(er|re|ral)|sensor|emission)_?)*(wavelengths?|wavelen|wvls?|wls?|lambdas?|waves?)(_?(nm|um))?"
+    r"((band|cent(er|re|ral)|sensor|emission)_?)*(wavelengths?|wavelen|wvls?|wls?|lambdas?|waves?)(_?(nm|um|3d))?"
 )
 _WIDTHS = re.compile(r"(fwhms?|band_?widths?|list_fwhm_[^_]*)(_?(nm|um))?")
 GOOD = re.compile(r"bbl|good_(wavelengths?|bands?)|list_cw_.*_flags")
-_NAMES = re.compile(r"band_?names?")
+NAMES = re.compile(r"band_?names?")
 _PARTS = r"[,;\s]"
 """What parts the items of a text."""
 _DIVISOR = "reflectance_scale_factor"
@@ -121,7 +121,7 @@ def state_bands(entries: Mapping[str, Any], where: str) -> StatedBands:
     width, fwhm = find(_WIDTHS, "", _unit_in(name), "nm", "um")
     good = find(GOOD, "")[1]
     marks = good and [int(mark) if isinstance(mark, bool) else mark for mark in good]
-    names, where = find(_NAMES, "", separators=",")[1], f"{where} '{named.get(name)}'"
+    names, where = find(NAMES, "", separators=",")[1], f"{where} '{named.get(name)}'"
     return StatedBands(where, centres, unit_of(name), fwhm, unit_of(width, is_of_all=False), marks, names)
 
 

@@ -81,8 +81,35 @@ def test_other_variables_of_matlab_are_passed_over(tmp_path, do_compression):
     scipy.io.savemat(tmp_path / "a.mat", {**others, "z_cube": doubles}, do_compression=do_compression)
     file = open_spectral_file(tmp_path / "a.mat", ReadOptions(dataset="z_cube"))
     check_file(file, dtype=np.dtype("f8"), values=doubles, nm=NM, bad=[1])
+    assert "not used: a_text, a_structure, b_cells" in file.notes[0]
     with pytest.raises(CaptureError, match=r"e_logical .*, wl \(5, 1\), bbl .*, z_cube \(8, 9, 5\)$"):
         open_spectral_file(tmp_path / "a.mat")
+
+
+@pytest.mark.parametrize(
+    "texts", ["450 500 550 600 650", [f"{nm:g}" for nm in NM], [f"{nm:g} nm" for nm in NM]]
+)
+@pytest.mark.parametrize("version", [5, 7, 7.3])
+def test_texts_of_matlab_may_hold_wavelengths(tmp_path, texts, version):
+    path = tmp_path / "a.mat"
+    if version == 7.3:
+        letters = np.array([list(text) for text in np.atleast_1d(texts)])
+        codes = np.vectorize(ord)(letters).astype("u2").T
+        content = {"cube": CUBE.T, "wavelengths": (codes, {"MATLAB_class": np.bytes_("char")})}
+        write_hdf5(path, content, begin=b"MATLAB 7.3 MAT-file")
+    else:
+        scipy.io.savemat(path, {"cube": CUBE, "wavelengths": texts}, do_compression=version == 7)
+    check_file(open_spectral_file(path), values=CUBE, nm=NM, notes=())
+
+
+def test_letters_of_netcdf3_may_hold_wavelengths(tmp_path):
+    with scipy.io.netcdf_file(tmp_path / "a.nc", "w") as file:
+        for axis, length in (*zip("yxb", CUBE.shape, strict=True), ("letters", 3)):
+            file.createDimension(axis, length)
+        file.createVariable("cube", "h", tuple("yxb"))[:] = PLAIN
+        letters = [list(f"{nm:g}".encode()) for nm in NM]
+        file.createVariable("wavelength", "c", ("b", "letters"))[:] = np.array(letters, "u1").view("S1")
+    check_file(open_spectral_file(tmp_path / "a.nc"), values=PLAIN, nm=NM)
 
 
 def test_compressed_variables_of_matlab_are_unpacked_piece_by_piece(tmp_path, monkeypatch):
@@ -91,9 +118,9 @@ def test_compressed_variables_of_matlab_are_unpacked_piece_by_piece(tmp_path, mo
     np.testing.assert_array_equal(open_spectral_file(tmp_path / "a.mat").read(), CUBE)
 
 
-def write_hdf5(path, content):
-    """Data sets by name, with attributes if they stand in a pair; None is a group."""
-    with h5py.File(path, "w") as file:
+def write_hdf5(path, content, begin=b""):
+    """Data sets by name, with attributes if they stand in a pair; None is a group. Other bytes may precede them."""
+    with h5py.File(path, "w", userblock_size=512 if begin else 0) as file:
         for name, given in content.items():
             values, attributes = given if isinstance(given, tuple) else (given, {})
             if values is None:
@@ -101,6 +128,9 @@ def write_hdf5(path, content):
             else:
                 file[name] = values
             file[name].attrs.update(attributes)
+    if begin:
+        with path.open("r+b") as opened:
+            opened.write(begin)
     return path
 
 
@@ -108,6 +138,7 @@ GOOD = np.array([True, False, True, True, True])
 PACKED, UM = {"scale_factor": 0.1}, [3, 5, 8, 11, 12]
 FACTORS = np.array([1.0, 2, 4, 5, 8])
 UNKNOWN = ("parsec", 150, None, ("FWHM are left out: they would be in 'parsec'",))
+BARE_AXIS = "This is a netCDF dimension but not a netCDF variable.         5"
 GAINS = np.array([0.1, 0.2, 0.3, 0.4, 0.5])
 HDF5: list[tuple[dict[str, Any], dict[str, Any]]] = [
     (  # facts of groups hold for the images in them
@@ -130,6 +161,33 @@ HDF5: list[tuple[dict[str, Any], dict[str, Any]]] = [
             [str(nm) for nm in NM],
             np.bytes_(list(map(str, NM))),
         )
+    ),
+    *(  # also as data sets of texts
+        ({"run/cube": CUBE, f"run/{name}": texts}, {"nm": NM, "notes": ()})
+        for name, texts in (
+            ("wavelengths", [str(nm) for nm in NM]),
+            ("wavelengths", np.bytes_(list(map(str, NM)))),
+            ("wavelengths", "450, 500, 550, 600, 650"),
+            ("wavelengths", [f"{nm:g} nm" for nm in NM]),
+            ("band", [f"{nm:g} nm" for nm in NM]),
+            ("band_names", "450 nm, 500 nm, 550 nm, 600 nm, 650 nm"),
+        )
+    ),
+    (  # the air lets no light through in these bands
+        {
+            "site/Reflectance": (None, {"Band_Window_1_Nanometers": [540, 610]}),
+            "site/Reflectance/Reflectance_Data": CUBE,
+            "site/Reflectance/Metadata/Spectral_Data/Wavelength": (NM, {"Units": "nanometers"}),
+        },
+        {"nm": NM, "bad": [2, 3]},
+    ),
+    (  # an axis of NetCDF without a variable holds nothing
+        {
+            "cube": CUBE,
+            "wavelength": (np.zeros(5, "f4"), {"NAME": BARE_AXIS}),
+            "sensor/wavelength_3d": (NM, {"units": "nm"}),
+        },
+        {"nm": NM, "warnings": (), "notes": ()},
     ),
     ({"run/cube": (CUBE, {"wavelengths": NM}), "run": (None, {"Scale Factor": 0.5})}, {"nm": NM, "scale": 2}),
     (  # what is nearest to an image counts, and units are those of their own list

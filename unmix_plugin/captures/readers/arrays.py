@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import prod
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -17,6 +17,7 @@ import numpy as np
 
 from unmix_plugin.captures.header_values import (
     GOOD,
+    NAMES,
     check_bands,
     counts_bands,
     exposure_facts,
@@ -31,6 +32,7 @@ from unmix_plugin.captures.names import common_length
 from unmix_plugin.captures.spectral_file import (
     Axes,
     BandIndex,
+    BandTable,
     Linear,
     ReadOptions,
     SpectralFile,
@@ -56,14 +58,17 @@ _MAY_DIVIDE = ("scale_factor", "scalefactor", "scale")
 never does."""
 _QUALITY = re.compile(r"(^|_)(err|error|errors|flags?|mask|quality|qa|uncertainty|std|stddev)(_|$)")
 """What an array of three axes is called that measures nothing itself."""
+_WINDOW = re.compile(r"band_window_\d+_nanometers", re.I)
 _AXIS_NAMES = {
     "b": "band bands wavelength wavelengths wl lambda channel spectral",
     "y": "y lat latitude row rows line lines downtrack northing height",
     "x": "x lon longitude col cols column columns sample samples crosstrack easting width",
 }
 _AXES = {name: axis for axis, names in _AXIS_NAMES.items() for name in names.split()}
-_NUMBERS = "iuf"
-"""NumPy's kinds of types that measure; marks of bands may also be booleans."""
+_NUMBERS, _TEXTS = "iuf", "OSU"
+"""NumPy's kinds of types that measure, where marks of bands may also be booleans; and of those that hold texts."""
+UNREAD = np.dtype("V")
+"""Type of what a file holds that is neither numbers nor texts."""
 _WITH_BANDS_AT: tuple[Axes, Axes, Axes] = ("byx", "ybx", "yxb")
 _LISTED = 12
 """How many arrays a message names."""
@@ -99,11 +104,7 @@ class FoundArray:
     def all_attributes(self) -> dict[str, Any]:
         """Its own attributes, and those inherited that it lacks, as texts, numbers or lists."""
         inherited = {key: value for key, value in self.inherited.items() if key not in self.attributes}
-        found = {**self.attributes, **inherited}
-        texts = {
-            key: value.decode("utf-8", "replace") for key, value in found.items() if isinstance(value, bytes)
-        }
-        return found | texts
+        return {key: _decoded(value) for key, value in {**self.attributes, **inherited}.items()}
 
     @property
     def is_vector(self) -> bool:
@@ -144,7 +145,7 @@ def image_of_arrays(
     given = options.wavelengths_nm if options.wavelengths_nm is not None else stated.centres
     axes = choose_axes(shape, fixed, None if given is None else len(given), warnings)
     of_image = image_shape(shape, axes)
-    bands = check_bands(stated, of_image[2], warnings)
+    bands = _without_windows(check_bands(stated, of_image[2], warnings), image)
     linear = _linear(path, image, of_image[2], warnings)
     applied = "" if linear is None else linear.evidence
     exposure = exposure_facts(
@@ -157,8 +158,13 @@ def image_of_arrays(
             return take(axes, rows, wanted).astype(dtype, copy=False)
         return take_part(image.whole().reshape(shape), axes, rows, wanted).astype(dtype, copy=False)
 
-    others = [one for one in arrays if one is not image and one.own_name not in (*_AXES, *_SIDES)]
-    others = [one.name for one in others if not is_exposure(one.own_name) and not says_bands(one.own_name)]
+    others = [
+        one.name
+        for one in arrays
+        if one.dtype == UNREAD
+        or not (one.own_name in (*_AXES, *_SIDES) or is_exposure(one.own_name) or _lists_bands(one))
+        if one is not image
+    ]
     return SpectralFile(
         path=path,
         reader=reader,
@@ -173,6 +179,14 @@ def image_of_arrays(
         warnings=tuple(warnings),
         metadata={**({"dataset": image.name} if len(arrays) > 1 else {}), "axes": axes, **exposure},
     )
+
+
+def _without_windows(table: BandTable, image: FoundArray) -> BandTable:
+    """The table with bands marked as bad where the air lets no light through, by NEON's `Band_Window_1_Nanometers`."""
+    nm, marks = table.wavelengths_nm, [] if table.bad is None else [table.bad]
+    windows = [_numbers(value) for key, value in image.all_attributes.items() if _WINDOW.fullmatch(key)]
+    marks += [(nm >= min(ends)) & (nm <= max(ends)) for ends in windows if nm is not None and ends]
+    return replace(table, bad=np.any(marks, axis=0) if marks else None)
 
 
 def choose_axes(
@@ -290,37 +304,60 @@ def _entries(arrays: Sequence[FoundArray], image: FoundArray) -> dict[str, Any]:
     return entries
 
 
+def _decoded(value: Any) -> Any:
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else value
+
+
 def _numbers_in_text(value: Any) -> Any:
     """A list of numbers that is written as a text, or as one text a number; anything else as it is."""
     if isinstance(value, str) or np.asarray(value).dtype.kind in "OSU":
-        texts = [
-            text.decode("utf-8", "replace") if isinstance(text, bytes) else text for text in listed(value)
-        ]
         with suppress(TypeError, ValueError):
-            return [float(text) for text in texts]
+            return [float(text) for text in listed(value)]
     return value
 
 
+def _lists_bands(array: FoundArray) -> bool:
+    """Whether it is called as a list of bands is, or a text as names of bands are."""
+    is_named = NAMES.fullmatch(array.own_name) or _AXES.get(array.own_name) == "b"
+    return says_bands(array.own_name) or bool(is_named and array.dtype.kind in _TEXTS)
+
+
 def _lists_beside(arrays: Sequence[FoundArray], image: FoundArray) -> dict[str, Any]:
-    """Numbers of bands, and exposures with their units, by name; of one name those in the nearest group."""
+    """Numbers and names of bands, and exposures with their units, by name; of one name those in the nearest group."""
 
     def groups_apart(array: FoundArray) -> int:
         return -common_length([one.name.strip("/").split("/")[:-1] for one in (image, array)])
 
     beside: dict[str, Any] = {}
     for array in sorted(arrays, key=groups_apart):
-        name, length = array.own_name, prod(array.shape)
-        lengths = (1, *image.shape) if is_exposure(name) else image.shape if says_bands(name) else ()
+        name, is_text = array.own_name, array.dtype.kind in _TEXTS
+        lengths = (1, *image.shape) if is_exposure(name) else image.shape if _lists_bands(array) else ()
         known = [key.rpartition("/")[2].lower() for key in beside]
-        if array is image or name in known or not array.is_vector or length not in lengths:
+        is_list = (*array.shape, 1)[0] in (1, *image.shape) if is_text else array.is_vector
+        if array is image or name in known or not (lengths and is_list):
             continue
-        own, numbers = plain_names(array.attributes), _unpacked(array)
+        numbers = _texts(array) if is_text else _unpacked(array)
+        if len(numbers) not in lengths:
+            continue
+        own = plain_names(array.attributes)
         unit = next((array.all_attributes[own[key]] for key in ("units", "unit") if key in own), None)
         if is_exposure(name):
             beside[name] = numbers if unit is None else [f"{number} {unit}" for number in numbers]
+        elif isinstance(numbers[0], str):
+            beside.setdefault("band names", numbers)
         elif name != "bands" or not counts_bands(numbers, unit):
             beside |= {array.name: numbers} | ({} if unit is None else {f"{name} units": unit})
     return beside
+
+
+def _texts(array: FoundArray) -> list[Any]:
+    """Texts of a list, or the items of a single one, as numbers where all are; of letters, a row is a text."""
+    stored = np.asarray(array.whole())
+    letters = stored.ndim == 2 and stored.dtype == "S1"
+    stored = [b"".join(row) for row in stored] if letters else stored.reshape(-1).tolist()
+    texts = [str(_decoded(text)) for text in stored]
+    found = _numbers_in_text(texts[0] if len(texts) == 1 else texts)
+    return listed(found, ",") if isinstance(found, str) else found
 
 
 def _unpacked(array: FoundArray) -> list[Any]:

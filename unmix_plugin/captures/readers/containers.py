@@ -21,7 +21,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from unmix_plugin.captures.readers.arrays import FoundArray, image_of_arrays
+from unmix_plugin.captures.readers.arrays import UNREAD, FoundArray, image_of_arrays
 from unmix_plugin.captures.spectral_file import (
     Axes,
     BandIndex,
@@ -181,6 +181,9 @@ def _list_netcdf3(path: Path) -> list[FoundArray]:
 
 # HDF5, read by h5py in slices.
 
+_BARE_AXIS = "This is a netCDF dimension but not a netCDF variable"
+"""What begins the attribute NAME of data sets that hold nothing. Source: netCDF-C, DIM_WITHOUT_VARIABLE."""
+
 
 def open_hdf5(path: Path, options: ReadOptions) -> SpectralFile:
     """Open the data set that is the image; MATLAB's have their axes in reverse order, which is undone. Raises
@@ -245,6 +248,14 @@ def _found_in_hdf5(
 ) -> list[FoundArray]:
     if not hasattr(item, "shape") or item.shape is None or "#refs#" in name:
         return []
+    attributes, dtype = _attributes(path, item), item.dtype
+    if _BARE_AXIS in str(attributes.get("NAME", "")):
+        return []
+    is_letters = is_matlab and attributes.get("MATLAB_class") == b"char"
+    if is_letters or import_extra("h5py").check_string_dtype(dtype) is not None:
+        dtype = np.dtype("O")
+    elif dtype.kind == "O":  # references, as MATLAB's cells are, or lists of different lengths
+        dtype = UNREAD
     shape = tuple(item.shape[::-1] if is_matlab else item.shape)
     is_cube = len(shape) == 3
     inherited = inherited if is_cube else {}
@@ -254,6 +265,8 @@ def _found_in_hdf5(
     def whole() -> np.ndarray:
         with import_extra("h5py").File(path, "r") as file:
             stored = np.asarray(file[name][()])
+        if is_letters:
+            return np.array(["".join(map(chr, row)) for row in np.atleast_2d(stored.T)])
         return stored.T if is_matlab else stored
 
     def take(axes: Axes, rows: slice, bands: BandIndex) -> np.ndarray:
@@ -263,21 +276,21 @@ def _found_in_hdf5(
             part = file[name][tuple(selection[axis] for axis in stored_axes)]
         return part.transpose([stored_axes.index(axis) for axis in "yxb"])
 
-    names = []  # of the axes, by NetCDF's dimension scales or by labels
-    for dimension in item.dims:
-        scales = [scale.name for scale in dimension.values()] if len(dimension) else []
-        names.append((scales[0] or "") if scales else dimension.label)
-    dimensions, faster = tuple(names) if any(names) else None, take if is_cube else None
-    fill = None
-    if item.dtype.kind in "iuf":
+    names, faster, fill = _axis_names(item), take if is_cube else None, None
+    if dtype.kind in "iuf":
         # HDF5 ends the process where a damaged value is asked for; asked whether there is one, it raises an error.
         item.id.get_create_plist().fill_value_defined()
         fill = float(item.fillvalue)
-    return [
-        FoundArray(
-            name, shape, item.dtype, whole, faster, _attributes(path, item), inherited, dimensions, fill
-        )
-    ]
+    return [FoundArray(name, shape, dtype, whole, faster, attributes, inherited, names, fill)]
+
+
+def _axis_names(item: Any) -> tuple[str, ...] | None:
+    """By NetCDF's dimension scales or by labels."""
+    names = []
+    for dimension in item.dims:
+        scales = [scale.name for scale in dimension.values()] if len(dimension) else []
+        names.append((scales[0] or "") if scales else dimension.label)
+    return tuple(names) if any(names) else None
 
 
 def _attributes(path: Path, item: Any) -> dict[str, Any]:
@@ -295,6 +308,8 @@ def _attributes(path: Path, item: Any) -> dict[str, Any]:
 # Source: The MathWorks, MAT-File Format, chapter 1 (level 5).
 
 _STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
+_CELLS_TO_SPARSE, _LETTERS = range(1, 6), 4
+_ENCODINGS = {2: "latin-1", 4: "utf-16-", 16: "utf-8", 17: "utf-16-", 18: "utf-32-"}
 _CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}
 _MATRIX, _COMPRESSED = 14, 15
 _IS_COMPLEX = 0x0800
@@ -304,7 +319,7 @@ _PIECE_BYTES = 2**20
 
 
 def _list_matlab(path: Path) -> list[FoundArray]:
-    """Variables; cells, structures, texts and complex numbers are passed over."""
+    """Variables, of which cells, structures and complex numbers are not read."""
     arrays: list[FoundArray] = []
     try:
         size = path.stat().st_size
@@ -339,7 +354,7 @@ def _elements(file: BinaryIO, order: str, size: int) -> Iterator[tuple[int, int,
 def _found_in_matlab(
     path: Path, file: BinaryIO, order: str, start: int, kind: int, length: int
 ) -> list[FoundArray]:
-    """An array of real numbers by the first bytes of its element; none for anything else.
+    """An array of real numbers or letters by the first bytes of its element, one of no numbers for anything else.
 
     Axes are in MATLAB's order, the first axis fastest. Files may hold a smaller type than the variable has.
     """
@@ -353,16 +368,20 @@ def _found_in_matlab(
         return []
     _, _, at, end = _tag(head, order, 0)
     (flags,) = struct.unpack_from(order + "I", head, at)
-    if flags & 0xFF not in _CLASSES or flags & _IS_COMPLEX:
+    if (own := flags & 0xFF) not in (*_CELLS_TO_SPARSE, *_CLASSES):
         return []
     _, size, at, end = _tag(head, order, end)
     shape = struct.unpack_from(f"{order}{size // 4}i", head, at)
     _, size, at, end = _tag(head, order, end)
     name = head[at : at + size].decode("utf-8", "replace")
+    if own not in _CLASSES or flags & _IS_COMPLEX:
+        texts = _matlab_texts(head, order, end, shape) if own == _LETTERS else []
+        found = np.array(texts) if texts else np.zeros((), UNREAD)
+        return [FoundArray(name, found.shape, found.dtype, lambda: found)] if name else []
     kind, size, at, _ = _tag(head, order, end)
     if kind not in _STORED or min(shape, default=-1) < 0:
         raise ValueError(f"variable '{name}' has the type {kind} and the shape {shape}")
-    stored, dtype, offset = np.dtype(order + _STORED[kind]), np.dtype(_CLASSES[flags & 0xFF]), start + at
+    stored, dtype, offset = np.dtype(order + _STORED[kind]), np.dtype(_CLASSES[own]), start + at
     if prod(shape) * stored.itemsize != size or at + size > length:
         raise ValueError(f"variable '{name}' of {shape} {stored.name} has {size} bytes")
     if packed is not None:
@@ -375,6 +394,17 @@ def _found_in_matlab(
         return np.memmap(path, stored, "r", offset, shape, order="F")
 
     return [FoundArray(name, shape, dtype, numbers)]
+
+
+def _matlab_texts(head: bytes, order: str, position: int, shape: tuple[int, ...]) -> list[str]:
+    """The text of each row of an array of letters; none where they are too many for its first bytes."""
+    kind, size, at, _ = _tag(head, order, position)
+    encoding = _ENCODINGS.get(kind, "latin-1")
+    encoding += {"<": "le", ">": "be"}[order] if encoding.endswith("-") else ""
+    letters = list(head[at : at + size].decode(encoding, "replace"))
+    if not letters or len(letters) != prod(shape):
+        return []
+    return ["".join(row) for row in np.array(letters).reshape(shape[0], -1, order="F")]
 
 
 def _tag(head: bytes, order: str, position: int) -> tuple[int, int, int, int]:
