@@ -285,6 +285,18 @@ def test_a_pixel_has_what_was_measured_there_beside_what_is_predicted(solid, exp
     assert min(picture_size(base.with_suffix(".png"))) > 300
 
 
+@pytest.mark.parametrize(
+    ("recipe", "words"),
+    [("edits: [{scale: {endmember: 0, factor: 0.5}}]", " before the edits"), ("illuminant: A", "")],
+)
+def test_what_was_measured_is_told_from_edited_materials(solid, tmp_path, recipe, words):
+    (tmp_path / "edits.yml").write_text(recipe)
+    common = ["spectrum", "--view", "eval_002", "--pixel", "8,8", "--run", solid.run, "--output", tmp_path]
+    done(export, *common, "--edits", tmp_path / "edits.yml")
+    heads = (tmp_path / "eval_002_x8_y8.csv").read_text().splitlines()[0].split(",")
+    assert heads == ["wavelength", "predicted", "diffuse", "specular", f"measured{words}"]
+
+
 def test_a_pixel_without_a_valid_value_has_no_measured_spectrum(solid, tmp_path, monkeypatch):
     valid = np.ones((16, 16), bool)
     valid[9, 8] = False

@@ -1,3 +1,4 @@
+import io
 import json
 from dataclasses import replace
 from unittest.mock import MagicMock
@@ -242,6 +243,19 @@ def test_a_textured_glb_has_its_segmentation_and_abundances_as_variants(textured
     mappings = primitive["extensions"]["KHR_materials_variants"]["mappings"]
     assert mappings[3] == {"material": 3, "variants": [3]}
     assert "map_Kd mesh_colour.png" in (textured / "mesh.mtl").read_text()
+
+
+def test_what_shows_nothing_from_above_has_no_material(tmp_path):
+    corners = np.array(
+        [[0.9, 0.0, 0.0], [0.9, 0.0, 0.1], [0.9, 0.1, 0.0]]
+    )  # its front faces away from the ball
+    beside = TriangleMesh(corners, np.array([[0, 1, 2]]))
+    assert beside.normals[0, 0] < 0
+    textures = _textures(SCENE, beside, 64)
+    _write_mesh(tmp_path, ("ply", "obj"), beside, SCENE, FRAME, textures=textures)
+    assert set(PlyData.read(tmp_path / "mesh.ply")["vertex"]["material"]) == {255}
+    assert "usemtl material_3_nothing" in (tmp_path / "mesh.obj").read_text()
+    assert (np.asarray(Image.open(io.BytesIO(textures.pictures["segmentation"]))) == 255).all()
 
 
 @pytest.mark.parametrize(

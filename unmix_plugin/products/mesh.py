@@ -18,6 +18,7 @@ import torch
 from jaxtyping import Float, Float32, Float64
 
 from unmix_plugin.errors import ConfigError
+from unmix_plugin.figures.pictures import id_palette
 from unmix_plugin.formats.files import (
     eight_bits,
     indexed_png_bytes,
@@ -29,6 +30,7 @@ from unmix_plugin.products.atlas import Atlas, texels_of, unwrap
 from unmix_plugin.products.product import Job
 from unmix_plugin.products.scene_products import Mesh
 from unmix_plugin.scenes.scene import Normalisation
+from unmix_plugin.spectral.segmentation import NOTHING_ID
 from unmix_plugin.trained.run_materials import endmember_colours
 from unmix_plugin.trained.run_views import directions_to_world, positions_for_files, world_up
 from unmix_plugin.trained.surface import SurfaceAppearance, look_from_above, property_names
@@ -132,7 +134,8 @@ def _textures(scene: TrainedScene, mesh: TriangleMesh, size: int | None) -> _Tex
         ids.append(looks.material_ids)
         shares.append(eight_bits(looks.abundances.numpy()))
     share_pictures = texels.texture(np.concatenate(shares))
-    names, palette = scene.materials.names, endmember_colours(scene.materials)
+    names = scene.materials.names
+    palette = id_palette(dict(enumerate(endmember_colours(scene.materials))))
     id_picture = texels.texture(np.concatenate(ids)[:, None])[..., 0]
     pictures = {
         "colour": rgba_png_bytes(texels.texture(np.concatenate(colours)), "diffuse colour, sRGB"),
@@ -212,7 +215,11 @@ def _write_obj(
             pictures.append(write_file(_texture_path(path.parent, name), content))
         shown = (textures.atlas.uv, textures.atlas.faces, pictures[0].name)
     vertices = (mesh.vertices, normals, looks.srgb)
-    named = (looks.materials.names, looks.palette, looks.comments(_WHAT))
+    names, palette = looks.materials.names, looks.palette
+    if (materials == NOTHING_ID).any():
+        materials, names = materials.clip(max=len(names)), (*names, "nothing")
+        palette = np.concatenate([palette, id_palette({})[:1]])
+    named = (names, palette, looks.comments(_WHAT))
     written = write_obj(path.with_suffix(""), *vertices, mesh.faces, materials, *named, shown)
     return [*written, *pictures]
 

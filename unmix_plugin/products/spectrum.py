@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from unmix_plugin.editing.recipe_files import read_recipe
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.figures.plotting import figure_bytes, mark_lone_points, plain_axes
 from unmix_plugin.formats.envi import envi_library_paths, write_envi_library
@@ -62,6 +63,8 @@ def export(job: Job, asked: Spectrum) -> list[Path]:
         spectra = probe.spectra["predicted"][None]
         [matches] = shown_matches(spectra, materials.bands, light, known, asked.compare)
         place = replace(place, matches=matches)
+    if asked.edits is not None and read_recipe(asked.edits).operations:
+        place = replace(place, unedited=" before the edits")
     written = _write_spectrum(job.folder, place, job.scene)
     if place.spread is not None:
         mean = probe.spectra["predicted"][None].astype(np.float32)
@@ -203,6 +206,8 @@ class _ProbedPlace:
     over_views: Float[np.ndarray, "N B"] | None = None
     """What training views measured, in the light of the prediction; they differ by noise, gloss, light that moves, and
     what poses or the surface are off."""
+    unedited: str = ""
+    """Words for what was measured, where the prediction is of edited materials."""
 
 
 def _spectrum_paths(folder: Path, name: str) -> list[Path]:
@@ -217,10 +222,10 @@ def _write_spectrum(folder: Path, place: _ProbedPlace, scene: TrainedScene) -> l
     table_path, facts_path, plot_path = _spectrum_paths(make_folder(folder), place.name)
     columns = dict(place.probe.spectra)
     if place.measured is not None:
-        columns["measured"] = place.measured.astype(np.float64)
+        columns[f"measured{place.unedited}"] = place.measured.astype(np.float64)
     if place.over_views is not None:
-        columns["mean over views"] = place.over_views.mean(axis=0)
-        columns["standard deviation over views"] = place.over_views.std(axis=0, ddof=1)
+        columns[f"mean over views{place.unedited}"] = place.over_views.mean(axis=0)
+        columns[f"standard deviation over views{place.unedited}"] = place.over_views.std(axis=0, ddof=1)
     if place.spread is not None:
         columns = {"mean": columns["predicted"].clip(min=0), "standard deviation": place.spread}
     values = np.stack(list(columns.values()))
@@ -238,12 +243,14 @@ def _draw_spectrum(place: _ProbedPlace, materials: Materials) -> bytes:
     lines, bars = figure.subplots(1, 2, width_ratios=[2.4, 1])
     wavelengths = materials.bands.centers_nm
     if place.measured is not None:
-        lines.plot(wavelengths, place.measured, color="0.55", linewidth=3.5, label="measured")
+        lines.plot(
+            wavelengths, place.measured, color="0.55", linewidth=3.5, label=f"measured{place.unedited}"
+        )
     lines.plot(wavelengths, place.probe.spectra["predicted"], color="black", linewidth=1.8, label="predicted")
     mean, spread, label = place.probe.spectra["predicted"], place.spread, "± 1 std. dev."
     if place.over_views is not None:
         mean, spread = place.over_views.mean(axis=0), place.over_views.std(axis=0, ddof=1)
-        label = f"{len(place.over_views)} training views, ± 1 std. dev."
+        label = f"{len(place.over_views)} training views{place.unedited}, ± 1 std. dev."
     if spread is not None:
         lines.fill_between(wavelengths, mean - spread, mean + spread, color="0.85", label=label)
     for style, shown in zip(("--", "-.", ":"), place.matches, strict=False):

@@ -289,9 +289,9 @@ class SurfaceAppearance:
 
     @property
     def material_ids(self) -> UInt8[np.ndarray, " P"]:
-        """Material of each point, chosen as in segmentations."""
+        """Material of each point, chosen as in segmentations; 255 where nothing is seen, whose abundances are 0."""
         scores = self.materials.scores_of(self.diffuse, self.abundances)
-        return material_ids(scores, torch.ones(len(scores))).numpy()
+        return material_ids(scores, self.abundances.sum(dim=-1)).numpy()
 
     @property
     def palette(self) -> Float64[np.ndarray, "K 3"]:
