@@ -15,7 +15,7 @@ from unmix_plugin.captures.plan import _background_rule as background_rule
 from unmix_plugin.captures.plan import _choose_mask as choose_mask
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import CaptureView
-from unmix_plugin.captures.writing.view_files import ViewRecipe, alpha_picture, write_view
+from unmix_plugin.captures.writing.view_files import UNLABELLED, ViewRecipe, alpha_picture, write_view
 from unmix_plugin.captures.writing.view_files import _clean as clean
 from unmix_plugin.captures.writing.view_files import _read_labels as read_labels
 from unmix_plugin.captures.writing.view_files import _read_view_masks as read_view_masks
@@ -57,6 +57,13 @@ def test_pictures_that_hold_no_labels_are_refused(tmp_path, pixels):
     Image.fromarray(pixels).save(tmp_path / "labels.png")
     with pytest.raises(CaptureError, match="expected labels of 0 to 255 in one channel"):
         read_labels(CaptureView("a", CUBE, labels=tmp_path / "labels.png"), WHOLE)
+
+
+def test_pixels_that_are_averaged_keep_the_label_that_all_of_them_have(tmp_path):
+    labels = np.arange(6, dtype=np.uint8)[:, None] // 3 + np.zeros((6, 8), np.uint8)
+    Image.fromarray(labels).save(tmp_path / "labels.png")
+    found = read_labels(CaptureView("a", CUBE, labels=tmp_path / "labels.png"), Raster(0, 1, 3, 3, 2))
+    np.testing.assert_array_equal(found, np.repeat([[0], [UNLABELLED], [1]], 3, axis=1))
 
 
 CUBE = file_of(np.zeros((6, 8, 2), np.uint16))

@@ -90,6 +90,17 @@ def test_a_reference_of_any_name_is_no_view_by_whichever_of_its_files_it_is_name
     assert told[0] == f"{capture.root}: 4 views of the layout cubes"
 
 
+def test_poses_in_an_array_beside_the_cubes_are_no_view(tmp_path: Path, capture):
+    frames = json.loads((capture.root / "transforms.json").read_text())["frames"]
+    matrices = np.array([frame["transform_matrix"] for frame in frames])[:, :3]
+    axes = [-matrices[..., 1], matrices[..., 0], matrices[..., 2], matrices[..., 3]]
+    sizes = np.broadcast_to([HEIGHT, WIDTH, 1.5 * WIDTH], (len(frames), 3))
+    table = np.stack([*axes, sizes], axis=-1).reshape(len(frames), 15)
+    np.save(capture.root / "poses_bounds.npy", np.hstack([table, np.ones((len(frames), 2))]))
+    scene, _ = made(tmp_path, capture, poses="poses_bounds.npy")
+    assert [frame.name for frame in scene.frames] == sorted(capture.reflectance)
+
+
 BRIGHT_SQUARE = np.zeros((HEIGHT, WIDTH), bool)
 BRIGHT_SQUARE[HEIGHT // 4 : 3 * HEIGHT // 4, WIDTH // 4 : 3 * WIDTH // 4] = True
 
@@ -170,7 +181,8 @@ def test_reflectances_that_are_divided_are_said_to_be(tmp_path: Path, capture):
     findings = process(capture.root, tmp_path / "scene", **stated)
     scale = scale_of(tmp_path / "scene")
     assert scale != 1
-    assert findings[0].startswith(f"values (reflectance) were divided by {scale:g}, as ")
+    why = "nearly all are below 0.05 (was the white exposed and lit as the views were?)"
+    assert findings[0].startswith(f"values (reflectance) were divided by {scale:g}, as {why}: ")
     said = process(capture.root, tmp_path / "kept", **stated, scale=1.0)
     for name, values in capture.reflectance.items():  # numbers whose meaning nobody stated
         write_cube(capture.root, name, (900 * values).astype(np.float32))

@@ -163,9 +163,16 @@ def make_plan(
     warned = [warning for sensor in sensors.values() for warning in sensor.warnings]
     if scale != 1.0 and options.scale is None and all(sensor.is_stated for sensor in sensors.values()):
         units = ", ".join(dict.fromkeys(sensor.unit for sensor in sensors.values()))
+        why = (
+            f"more than {_MOST_ABOVE_ONE:.0%} are above 1"
+            if scale > 1
+            else f"nearly all are below {_LEAST_BRIGHT:g}"
+        )
+        if any("white" in sensor.evidence for sensor in sensors.values()):
+            why += " (was the white exposed and lit as the views were?)"
         warned.append(
-            f"values ({units}) were divided by {scale:g}, as more than 1 % are above 1 or nearly all are small: "
-            f"multiply exported spectra by {scale:g}, or keep values with --scale 1, which cuts off those above 1"
+            f"values ({units}) were divided by {scale:g}, as {why}: multiply exported spectra by {scale:g}, or keep "
+            "values with --scale 1, which cuts off those above 1"
         )
     each = [(view.name, file) for view in views for file in (view.cube, *view.references)]
     each += [(file.path.name, file) for file in opened]

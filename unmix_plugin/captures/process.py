@@ -158,6 +158,8 @@ def _check(options: ProcessOptions) -> None:
 def _open_capture(options: ProcessOptions, references: Sequence[SpectralFile | None]) -> Capture:
     wavelengths = None if options.wavelengths is None else parse_wavelengths(options.wavelengths)
     named = tuple(path for file in references if file is not None for path in file.files)
+    if options.poses is not None:  # an array, perhaps
+        named += (Path(options.poses), options.data / options.poses)
     asked = ReadOptions(options.dataset, wavelengths, options.axes, exclude=named)
     capture = _by_size(find_views(options.layout, options.data, asked))
     first: dict[str, SpectralFile] = {}

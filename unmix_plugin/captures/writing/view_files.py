@@ -359,9 +359,9 @@ def _read_view_masks(view: CaptureView, raster: Raster, use_opacity: bool) -> _V
 
 
 def _read_labels(view: CaptureView, raster: Raster) -> UInt8[np.ndarray, "H W"] | None:
-    """True materials of a view; None if it has none, or if pixels are averaged. Raises CaptureError: the file can't be
-    read, has another size than the cube, or is a picture in colour."""
-    if view.labels is None or raster.binning > 1:
+    """True materials of a view, none where several share a square that is averaged; None if it has no labels. Raises
+    CaptureError: the file can't be read, has another size than the cube, or is a picture in colour."""
+    if view.labels is None:
         return None
     labels = _read(view.labels, np.asarray, view)
     is_flat = labels.ndim == 2 and labels.dtype.kind in "bui"
@@ -370,7 +370,10 @@ def _read_labels(view: CaptureView, raster: Raster) -> UInt8[np.ndarray, "H W"] 
         raise CaptureError(
             f"{view.labels}: {channels} of {labels.dtype.name}; expected labels of 0 to 255 in one channel"
         )
-    return labels[raster.pixels].astype(np.uint8)
+    labels, side = labels[raster.pixels].astype(np.uint8), raster.binning
+    first = labels[::side, ::side]
+    mixed = raster.any_in_square(labels != first.repeat(side, axis=0).repeat(side, axis=1))
+    return np.where(mixed, np.uint8(UNLABELLED), first)
 
 
 def _alpha(view: CaptureView) -> UInt8[np.ndarray, "H W"] | None:
