@@ -40,6 +40,18 @@ def test_materials_and_their_shares_are_found_in_whole_numbers_of_any_unit():
     assert found.misfit.max() < 0.2
 
 
+@pytest.mark.usefixtures("few_searches")
+@pytest.mark.parametrize("endmembers", [3, "auto"])
+def test_in_few_bands_there_may_be_as_many_materials_as_bands(endmembers):
+    """No band follows from the others then, so that noise is unknown."""
+    materials = torch.tensor([[0.8, 0.1, 0.1], [0.1, 0.7, 0.2], [0.1, 0.2, 0.9]], dtype=torch.float64)
+    found = inspect.unwrap(unmix_image)(image_of(materials), endmembers, seed=np.int64(1))
+    angles = spectral_angle(materials[:, None].float(), torch.from_numpy(found.endmembers)[None])
+    assert angles.shape == (3, 3)
+    assert float(angles.amin(1).max()) < 0.03
+    assert "HySime" not in found.evidence
+
+
 def test_the_misfit_of_an_exact_mixture_is_0():
     shade = torch.rand(20, 20, 1, generator=seeded()) + 0.2
     assert unmix_image((shade * smooth_endmembers(1)[0].float()).numpy(), 1).misfit.max() < 1e-5
@@ -127,6 +139,8 @@ CUBE = image_of(smooth_endmembers(3))
         ({"cube": np.where(CUBE.max() * 0.9 < CUBE, np.nan, CUBE)}, "hold NaN or infinite values; leave"),
         ({"cube": np.full_like(CUBE, 0.3)}, "only 1 distinct pixels .* ask for at most 1"),
         ({"cube": CUBE[:, :, :2]}, "between 1 and the number of bands, 2; found 3"),
+        ({"seed": 1.5}, "seed must be a whole number .* found 1.5"),
+        ({"seed": 2**63}, "seed must be a whole number"),
         ({"endmembers": 0}, "between 1 and the number of bands"),
         ({"endmembers": 12}, "at most [3-5] materials can be told apart; 12 were asked for"),
         ({"mask": np.ones((3, 3), bool)}, "mask must be 40 x 40"),

@@ -23,7 +23,7 @@ from unmix_plugin.spectral.unmixing.endmembers import (
     equal_peaks,
     usable_pixels,
 )
-from unmix_plugin.spectral.unmixing.num_materials import hysime, propose_num_materials
+from unmix_plugin.spectral.unmixing.num_materials import LEAST_BANDS, hysime, propose_num_materials
 from unmix_plugin.spectral.unmixing.pooled_search import PooledEndmembers, pooled_search
 
 _LIT = 0.9
@@ -92,6 +92,8 @@ def unmix_image(
         raise SpectrumError(f"an image to unmix is a NumPy array; found {type(cube).__name__}")
     if not (isinstance(endmembers, int | np.integer) or endmembers == "auto"):
         raise SpectrumError(f"endmembers must be a whole number or 'auto'; found {endmembers!r}")
+    if not (isinstance(seed, int | np.integer) and -(2**63) <= seed < 2**63):
+        raise SpectrumError(f"seed must be a whole number of at most 63 bits; found {seed!r}")
     if shares not in get_args(Shares):
         raise SpectrumError(f"shares must be {', '.join(get_args(Shares))}; found {shares!r}")
     used = _used_pixels(cube, mask)
@@ -103,7 +105,7 @@ def unmix_image(
     if not brightest > 0:
         raise SpectrumError("the image is black: no pixel to use holds a value above 0")
     pixels = spectra * (_LIT / brightest)
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(int(seed))
     count, evidence = _proposed(pixels, generator) if endmembers == "auto" else (endmembers, "")
     usable = usable_pixels(pixels, count, generator)
     _require_signal(usable, count)
@@ -168,7 +170,7 @@ def _proposed(pixels: Float[Tensor, "N B"], generator: torch.Generator) -> tuple
 def _require_signal(usable: Float[Tensor, "N B"], count: int) -> None:
     """Refuse more materials than the pixels can tell apart: K of them, one among the others, span K - 1 dimensions."""
     num_pixels, num_bands = usable.shape
-    if num_bands <= 2 or num_pixels <= num_bands:
+    if num_bands < LEAST_BANDS or num_pixels <= num_bands:
         return
     dimensions = hysime(usable)
     if count > dimensions + 1:

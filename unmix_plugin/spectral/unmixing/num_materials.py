@@ -21,6 +21,9 @@ from torch import Tensor
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.unmixing.two_material_mixtures import two_material_fits
 
+LEAST_BANDS = 8
+"""By which noise is known: where materials are as many as bands, no band follows from the others, and signals count as
+noise."""
 _MOST_MATERIALS = 12
 """Largest number tried."""
 _LEAST_SHARE, _LEAST_FALL = 0.2, 0.004
@@ -39,7 +42,7 @@ class _MaterialCount:
     noise_distance: float
     """Mean distance that noise alone would make."""
     signal_dimensions: int | None
-    """What HySime counts; None where there are too few pixels for it."""
+    """What HySime counts; None where there are too few pixels or bands for it."""
 
     def evidence(self) -> str:
         """Why this number, in a few lines for people."""
@@ -63,7 +66,7 @@ def propose_num_materials(pixels: Float[Tensor, "N B"], generator: torch.Generat
     that are neither dark nor saturated, background left out."""
     num_pixels, num_bands = pixels.shape
     fits = two_material_fits(pixels, min(_MOST_MATERIALS, num_bands), generator)
-    is_enough = num_bands > 2 and num_pixels > num_bands
+    is_enough = num_bands >= LEAST_BANDS and num_pixels > num_bands
     noise = _noise_distance(pixels) if is_enough else 0.0
     # Distances in independent directions add as squares.
     distances = tuple(math.sqrt(max(fit.mean_distance**2 - noise**2, 0.0)) for fit in fits)
