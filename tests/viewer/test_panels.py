@@ -83,6 +83,7 @@ def test_an_index_is_chosen_by_name_or_typed_as_a_formula_and_a_wrong_one_says_w
     page.set("formula", "")
     page.set("index", names[0])
     page.wait_until(lambda: "characters" not in page.texts and "photochemical" in page.texts)
+    assert "from the bands at" in page.texts
     page.wait_until(lambda: np.abs(decoded(page.last_picture) - first).mean() < 3)
 
 

@@ -69,7 +69,7 @@ class CapturePanel:
             self._seconds = gui.add_number("seconds", 4.0, min=0.5, max=120.0, step=0.5)
             self._fps = gui.add_number("frames a second", 24, min=1, max=60, step=1)
             session.add_buttons("preview", ("play", "stop"), self._play)
-            session.add_button("save the path", lambda: session.say("saved", str(self._save_path())))
+            session.add_button("save the path", lambda: self._say_saved(self._save_path()))
             session.add_button("render a video", self._render_video)
             session.add_button("cancel the video", self._cancel_video, "gray")
             self._video_progress = gui.add_progress_bar(0.0)
@@ -138,7 +138,10 @@ class CapturePanel:
         """Offer a file that was written to the browser as well, if it is not too large."""
         if path.stat().st_size <= _LARGEST_DOWNLOAD:
             self._session.client.send_file_download(path.name, path.read_bytes())
-        self._session.say("saved", str(path))
+        self._say_saved(path)
+
+    def _say_saved(self, path: Path) -> None:
+        self._session.say("saved", f"{path.name} in {path.parent}")  # the ends of long paths are cut off
 
     def _add_key(self) -> None:
         if len(self._keys) >= _MOST_KEY_FRAMES:

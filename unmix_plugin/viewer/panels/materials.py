@@ -166,7 +166,7 @@ class MaterialsPanel:
         self._saved.options = self._files()
         self._saved.value = path.name
         self._session.client.send_file_download(path.name, content)
-        self._session.say("saved", f"{path}; other commands take it as --edits {path}")
+        self._session.say("saved", f"{path.name} in {path.parent}; other commands take it as --edits")
 
     def _load(self) -> None:
         files = self._saved.options = self._files()

@@ -218,7 +218,7 @@ class ProbePanel:
         ):
             path = write_file(new_file(folder, name, ".csv", name), content)
             self._session.client.send_file_download(path.name, content)
-        self._session.say("saved", f"{folder}: spectra and abundances of {len(self._probes)} probes")
+        self._session.say("saved", f"spectra and abundances of the probes in {folder}")
 
     def _forget(self) -> None:
         for one in list(self._probes):

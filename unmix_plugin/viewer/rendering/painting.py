@@ -222,7 +222,7 @@ def _swatches(names: Sequence[str], colours: Float[Tensor, "K 3"]) -> Legend:
 _CHUNK = 1 << 16
 """Pixels whose spectra are held at once."""
 
-_LONGEST_LABEL = 120
+_LONGEST_LABEL = 200
 
 
 def index_output(asked: str) -> str:
