@@ -10,6 +10,7 @@ from PIL import Image
 
 from tests.captures.file_factory import file_of
 from unmix_plugin.captures.options import ProcessOptions
+from unmix_plugin.captures.plan import _is_below_black as is_below_black
 from unmix_plugin.captures.spectral_file import BandTable, CaptureView
 from unmix_plugin.captures.value_checks import ViewSample, check_files, check_values
 from unmix_plugin.captures.writing.view_files import ViewRecord
@@ -62,6 +63,24 @@ def test_what_light_does_not_do_is_found_and_named(change, words):
         [replace(one, spectra=change(one.spectra, i).astype(np.float32)) for i, one in enumerate(scene())]
     )
     assert re.search(words, finding), finding
+
+
+def test_a_band_is_not_judged_by_bands_beyond_a_gap():
+    kept, lamp = [0, 1, 2, 6, 7, 8, 9, 10, 11], 1 / (1 + ((WAVELENGTHS_NM - 550) / 60) ** 2)
+    found: list[str] = []
+    samples = [replace(one, spectra=(one.spectra * lamp)[:, kept]) for one in scene()]
+    check_values(samples, np.full((10, 10), 30.0), WAVELENGTHS_NM[kept], found)
+    assert found == []
+
+
+@pytest.mark.parametrize(
+    ("black", "level", "expected"), [(1.0, 0.0, False), (0.5, 0.1, True), (0.0, 0.3, True)]
+)
+def test_a_dark_frame_that_is_taken_off_twice_is_told_from_noise_around_black(black, level: float, expected):
+    generator = np.random.default_rng(0)
+    values = np.where(generator.random((5000, 1)) < black, 0.0, generator.random((5000, 1))) * np.ones(6)
+    noisy = values - level + generator.normal(0, 0.02, values.shape)
+    assert is_below_black(noisy.astype(np.float32)) == expected
 
 
 INVERTED = {"brightness": 0.001, "background_brightness": 0.4, "background_spread": 0.9}

@@ -50,6 +50,9 @@ _MOST_ABOVE_ONE = 0.01
 """Share of reflectances above 1 that is still taken for highlights."""
 _LEAST_BRIGHT = 0.05
 """Bright values below this would lose digits if they were kept."""
+_MOST_BELOW, _LEAST_LEVEL, _PILED_UP = 0.02, 0.005, 0.84
+"""Share of a band's values below 0, and their mean over what is bright and over their root mean square, above which a
+level was taken off: of noise around black the last is 0.8, of a level 1."""
 
 
 @dataclass(frozen=True)
@@ -161,19 +164,7 @@ def make_plan(
     texts = (options.wavelengths or "", options.white_reflectance)  # numbers, or the name of a table
     tables = filter(os.path.isfile, texts)
     warned = [warning for sensor in sensors.values() for warning in sensor.warnings]
-    if scale != 1.0 and options.scale is None and all(sensor.is_stated for sensor in sensors.values()):
-        units = ", ".join(dict.fromkeys(sensor.unit for sensor in sensors.values()))
-        why = (
-            f"more than {_MOST_ABOVE_ONE:.0%} are above 1"
-            if scale > 1
-            else f"nearly all are below {_LEAST_BRIGHT:g}"
-        )
-        if any("white" in sensor.evidence for sensor in sensors.values()):
-            why += " (was the white exposed and lit as the views were?)"
-        warned.append(
-            f"values ({units}) were divided by {scale:g}, as {why}: multiply exported spectra by {scale:g}, or keep "
-            "values with --scale 1, which cuts off those above 1"
-        )
+    warned += _doubts_of_values([*sensors.values()], 1.0 if options.scale is not None else scale)
     each = [(view.name, file) for view in views for file in (view.cube, *view.references)]
     each += [(file.path.name, file) for file in opened]
     return Plan(
@@ -225,6 +216,36 @@ def _with_one_exposure(sensors: dict[str, Sensor], first: dict[str, SpectralFile
     noted = (*one.notes, *(notes if known or common is None else ()))
     brought[first_name] = replace(one, notes=noted, warnings=(*one.warnings, *warnings))
     return brought
+
+
+def _doubts_of_values(sensors: Sequence[Sensor], found_scale: float) -> Iterator[str]:
+    """What may be wrong with the references, by the values that come of them, one sentence each."""
+    if found_scale != 1.0 and all(sensor.is_stated for sensor in sensors):
+        units = ", ".join(dict.fromkeys(sensor.unit for sensor in sensors))
+        why = f"more than {_MOST_ABOVE_ONE:.0%} are above 1"
+        why = why if found_scale > 1 else f"nearly all are below {_LEAST_BRIGHT:g}"
+        if any("white" in sensor.evidence for sensor in sensors):
+            why += " (was the white exposed and lit as the views were?)"
+        yield (
+            f"values ({units}) were divided by {found_scale:g}, as {why}: multiply exported spectra by "
+            f"{found_scale:g}, or keep values with --scale 1, which cuts off those above 1"
+        )
+    if any(_is_below_black(sensor.sample) for sensor in sensors):
+        yield (
+            "values lie below 0 by more than noise, and are written as 0: the dark frame is brighter than that of "
+            "these views, or was taken off their numbers before"
+        )
+
+
+def _is_below_black(sample: Float32[np.ndarray, "N c"]) -> bool:
+    """Whether values pile up below 0 in half of the bands that have many there."""
+    below = np.clip(-sample.astype(np.float64), 0.0, None)
+    count, total = (below > 0).sum(axis=0), below.sum(axis=0)
+    judged = count > max(100, _MOST_BELOW * len(sample))
+    bright = np.percentile(sample, BRIGHT_PERCENTILE, axis=0)[judged]
+    count, total, below = count[judged], total[judged], below[:, judged]
+    piled = total > _PILED_UP * np.sqrt(count * (below**2).sum(axis=0))
+    return bool(judged.any()) and bool(np.mean(piled & (total > _LEAST_LEVEL * bright * count)) >= 0.5)
 
 
 def _choose_scale(sensors: Sequence[Sensor], given: float | None) -> tuple[float, str]:

@@ -55,6 +55,8 @@ _LEAST_LEVEL = 0.002
 """The same, as a share of the mean spectrum."""
 _BAND_GAIN, _BAND_DEVIATIONS, _PIXEL_DEVIATIONS = 0.15, 5.0, 2.5
 """Logarithm of a band over what its neighbours say, also in standard deviations over bands and over pixels."""
+_GAP = 3.0
+"""Step between bands, over the usual one, beyond which nothing follows from neighbours."""
 _MOST_ODD = 5
 """Bands of which each may have a gain of its own."""
 _BLACK_SHARE, _TEXTURE = 0.1, 0.3
@@ -230,8 +232,8 @@ def _excess(
 ) -> Float64[np.ndarray, "P B"]:
     """Logarithm of the gain by which each band stands out from a smooth course through those around it.
 
-    A gain of one band shows as +1 there and as -1/2 at both neighbours. 0 at the two bands of either end, of which not
-    all neighbours are known.
+    A gain of one band shows as +1 there and as -1/2 at both neighbours. 0 at the two bands of either end and beside a
+    gap, of which not all neighbours are known.
     """
     low, middle, high = wavelengths_nm[:-2], wavelengths_nm[1:-1], wavelengths_nm[2:]
     part = (middle - low) / (high - low)
@@ -239,6 +241,9 @@ def _excess(
     bends[:, 1:-1] = logs[:, 1:-1] - logs[:, :-2] * (1 - part) - logs[:, 2:] * part
     excess = np.zeros_like(logs)
     excess[:, 2:-2] = (bends[:, 2:-2] - 0.5 * (bends[:, 1:-3] + bends[:, 3:-1])) / 1.5
+    steps = np.diff(wavelengths_nm)
+    for step in np.flatnonzero(steps > _GAP * np.median(steps)):
+        excess[:, max(0, step - 1) : step + 3] = 0.0
     return excess
 
 

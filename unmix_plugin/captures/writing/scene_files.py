@@ -44,10 +44,6 @@ _MOST_BANDS = 8
 """Bands left out for one reason that are named."""
 
 
-_NOISE_BELOW = 0.05
-"""Share of the values of matter that noise may take below 0."""
-
-
 def write_scene_files(
     folder: Path, plan: Plan, posed: PosedViews, records: dict[str, ViewRecord], options: ProcessOptions
 ) -> list[str]:
@@ -236,14 +232,9 @@ def _what_was_done(plan: Plan, posed: PosedViews, views: Sequence[ViewRecord]) -
 
     num_values = sum(view.num_pixels * len(plan.sensors[view.sensor].centers_nm) for view in views)
     negative = sum(view.negative_values for view in views) / max(num_values, 1)
-    # Noise around black takes up to half of what is not matter below 0.
-    dark = _NOISE_BELOW + 0.5 * float(np.mean([1 - view.matter_share for view in views]))
-    judged = "as noise around black does"
-    if negative > dark:
-        judged = "more than noise explains: is the dark frame right?"
     lines.append(
         f"{total('saturated_pixels')} with saturated bands, which are written as 1; {total('clipped_values')} above 1, "
-        f"written as 1 too; {total('negative_values')} below 0 ({negative:.1%} of all, {judged}), written as 0; "
+        f"written as 1 too; {total('negative_values')} below 0 ({negative:.1%} of all), written as 0; "
         f"{total('missing_pixels')} masked, as nothing was measured there"
     )
     share = f"{np.mean([view.matter_share for view in views]):.0%} of the pixels are matter"
