@@ -68,7 +68,7 @@ def test_what_light_does_not_do_is_found_and_named(change, words):
 def test_a_band_is_not_judged_by_bands_beyond_a_gap():
     kept, lamp = [0, 1, 2, 6, 7, 8, 9, 10, 11], 1 / (1 + ((WAVELENGTHS_NM - 550) / 60) ** 2)
     found: list[str] = []
-    samples = [replace(one, spectra=(one.spectra * lamp)[:, kept]) for one in scene()]
+    samples = [replace(one, spectra=(one.spectra * lamp)[:, kept].astype(np.float32)) for one in scene()]
     check_values(samples, np.full((10, 10), 30.0), WAVELENGTHS_NM[kept], found)
     assert found == []
 
