@@ -128,6 +128,13 @@ def test_minimum_noise_fractions_are_those_of_spectral_python():
     np.testing.assert_allclose(np.var(np.diff(ours, axis=1), axis=(0, 1)) / 2, 1, rtol=0.02)
 
 
+def test_the_minimum_noise_fraction_of_one_band_is_the_band_in_units_of_its_noise():
+    band = noisy_image()[..., :1]
+    found = minimum_noise_fractions(torch.from_numpy(band), torch.ones(30, 40, dtype=torch.bool), 1)
+    noise = np.diff(band, axis=1).std(ddof=1) / 2**0.5
+    np.testing.assert_allclose(found.components.abs(), np.abs(band - band.mean()) / noise)
+
+
 def test_minimum_noise_fractions_refuse_bands_without_noise_of_their_own():
     image = torch.from_numpy(noisy_image())
     mask = torch.ones(30, 40, dtype=torch.bool)

@@ -152,7 +152,7 @@ def minimum_noise_fractions(
     if len(steps) <= bands:
         raise SpectrumError(f"the noise of {bands} bands takes more pairs of neighbours; found {len(steps)}")
     mean = data[mask].mean(dim=0)
-    noise, total = torch.cov(steps.T) / 2, torch.cov(data[mask].T)
+    noise, total = (torch.cov(some.T).reshape(bands, bands) for some in (steps / 2**0.5, data[mask]))
     factor, failed = torch.linalg.cholesky_ex(noise)
     if failed or not factor.diagonal().min() > 1e-7 * factor.diagonal().max():
         raise SpectrumError(
