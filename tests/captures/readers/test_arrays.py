@@ -158,6 +158,7 @@ HDF5: list[tuple[dict[str, Any], dict[str, Any]]] = [
         for text in (
             ", ".join(map(str, NM)),
             str(np.array(NM)),
+            ", ".join(f"{nm:g} nm" for nm in NM),
             [str(nm) for nm in NM],
             np.bytes_(list(map(str, NM))),
         )
@@ -251,6 +252,19 @@ def test_axes_by_the_names_of_netcdf4(tmp_path):
             file["radiance"].dims[axis].attach_scale(file[name])
         file["radiance"].attrs["scale_factor"] = 0.0001
     check_file(open_spectral_file(tmp_path / "a.nc"), values=square, scale=10000, notes=())
+
+
+@pytest.mark.parametrize(
+    "names",
+    [("wavelength", "lat", "lon"), ("nbands", "nrows", "ncols"), ("wavelength_nm", "nlines", "nsamples")],
+)
+def test_axes_without_coordinates_by_their_names(tmp_path, names):
+    with h5py.File(tmp_path / "a.nc", "w") as opened:
+        file: Any = opened
+        file["radiance"] = CUBE[:5, :5].transpose(2, 0, 1)
+        for axis, name in enumerate(names):
+            file["radiance"].dims[axis].label = name
+    check_file(open_spectral_file(tmp_path / "a.nc"), values=CUBE[:5, :5], warnings=())
 
 
 @pytest.mark.parametrize(

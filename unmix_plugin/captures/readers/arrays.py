@@ -60,9 +60,9 @@ _QUALITY = re.compile(r"(^|_)(err|error|errors|flags?|mask|quality|qa|uncertaint
 """What an array of three axes is called that measures nothing itself."""
 _WINDOW = re.compile(r"band_window_\d+_nanometers", re.I)
 _AXIS_NAMES = {
-    "b": "band bands wavelength wavelengths wl lambda channel spectral",
-    "y": "y lat latitude row rows line lines downtrack northing height",
-    "x": "x lon longitude col cols column columns sample samples crosstrack easting width",
+    "b": "band bands nbands wavelength wavelengths wavelength_nm wavelength_3d wl lambda channel spectral",
+    "y": "y lat latitude row rows nrows line lines nlines downtrack northing height",
+    "x": "x lon longitude col cols ncols column columns sample samples nsamples crosstrack easting width",
 }
 _AXES = {name: axis for axis, names in _AXIS_NAMES.items() for name in names.split()}
 _NUMBERS, _TEXTS = "iuf", "OSU"
@@ -299,6 +299,8 @@ def _entries(arrays: Sequence[FoundArray], image: FoundArray) -> dict[str, Any]:
             _numbers_in_text(attributes[key]) if says_bands(key.lower()) else attributes[key]
         )
         kinds = _NUMBERS + "b" * bool(GOOD.fullmatch(key.lower()))
+        if says_bands(key.lower()) and values.dtype.kind in _TEXTS and len(values) in image.shape:
+            entries.setdefault("band names", values)
         if values.ndim == 1 and values.dtype.kind in kinds and len(values) in image.shape:
             entries.setdefault(key, values)
     return entries
@@ -309,10 +311,11 @@ def _decoded(value: Any) -> Any:
 
 
 def _numbers_in_text(value: Any) -> Any:
-    """A list of numbers that is written as a text, or as one text a number; anything else as it is."""
-    if isinstance(value, str) or np.asarray(value).dtype.kind in "OSU":
+    """Items of a text, or texts, as numbers where all are; anything else as it is."""
+    if isinstance(value, str) or np.asarray(value).dtype.kind in _TEXTS:
         with suppress(TypeError, ValueError):
             return [float(text) for text in listed(value)]
+        return [str(_decoded(text)) for text in listed(value, ",")]
     return value
 
 
@@ -354,10 +357,8 @@ def _texts(array: FoundArray) -> list[Any]:
     """Texts of a list, or the items of a single one, as numbers where all are; of letters, a row is a text."""
     stored = np.asarray(array.whole())
     letters = stored.ndim == 2 and stored.dtype == "S1"
-    stored = [b"".join(row) for row in stored] if letters else stored.reshape(-1).tolist()
-    texts = [str(_decoded(text)) for text in stored]
-    found = _numbers_in_text(texts[0] if len(texts) == 1 else texts)
-    return listed(found, ",") if isinstance(found, str) else found
+    texts = [b"".join(row) for row in stored] if letters else stored.reshape(-1).tolist()
+    return _numbers_in_text(_decoded(texts[0]) if len(texts) == 1 else texts)
 
 
 def _unpacked(array: FoundArray) -> list[Any]:
