@@ -67,6 +67,21 @@ def test_a_geotiff_has_the_ball_where_it_is(folder, view, axes):
     assert len(keys) == keys[0, 3] + 1
 
 
+def test_pixels_in_which_nothing_is_are_no_data_of_other_programs(tmp_path):
+    outputs = {"depth": 0, "ray_distance": 0, "segmentation": 255, "accumulation": None}
+    rendered(tmp_path, [*outputs], ["tif", "envi"], 0.5)
+    for name, nothing in outputs.items():
+        with tifffile.TiffFile(tmp_path / name / "map_top.tif") as file:
+            page, values = file.pages.first, file.asarray()
+        assert ("GDAL_NODATA" in page.tags) == (nothing is not None)
+        if nothing is not None:
+            assert page.nodata == nothing
+            assert 0 < (values == nothing).sum() < values.size
+        if name != "segmentation":
+            image: Any = envi.open(tmp_path / name / "map_top.hdr")
+            assert image.metadata.get("data ignore value") == (None if nothing is None else str(nothing))
+
+
 def test_an_envi_header_says_the_same(folder):
     image: Any = envi.open(folder / "spectral" / "map_top.hdr")
     kind, column, row, left, top, x, y, units = image.metadata["map info"]

@@ -45,6 +45,8 @@ _Format = Literal["envi", "exr", "npy", "png", "mp4", "tif"]
 _FORMATS: tuple[_Format, ...] = get_args(_Format)
 _LARGEST_TIFF = 1 << 31
 """Bytes; of more numbers BigTIFF is written, as addresses in a TIFF end at 4 GiB."""
+_GDAL_NODATA = 42113
+"""Tag of GDAL's."""
 _DEFAULT_STILLS = ("spectral", "rgb", "abundances", "segmentation", "depth")
 
 
@@ -349,11 +351,20 @@ def _envi(output: Output, path: Path, setting: RenderSetting) -> Iterator[RowsSi
     bands = setting.bands if output.kind in ("channels", "spectra") else None
     description = setting.described(output)
     more = {} if setting.map_info is None else dict(setting.map_info.envi)
+    if (nothing := _nothing(output)) is not None:
+        more["data ignore value"] = nothing
     if isinstance(output, MaterialOutput) and output.centers_nm:
         # In the order of the channels, which for a false colour is seldom that of bands.
         more |= {"wavelength units": "Nanometers", "wavelength": output.centers_nm}
     with envi_cube_rows(path.with_suffix(""), shape, bands, list(names), description, more) as add:
         yield lambda rows: add(rows.values[output.name].reshape(-1, *shape[1:]))
+
+
+def _nothing(output: Output) -> int | None:
+    """The number of pixels in which nothing is, where only that tells them: means of other programs leave it out."""
+    if output.kind == "labels":
+        return NOTHING_ID
+    return 0 if output.name in ("depth", "ray_distance") else None
 
 
 @contextmanager
@@ -362,6 +373,9 @@ def _tif(output: Output, path: Path, setting: RenderSetting) -> Iterator[RowsSin
     add, planes, _ = _whole(output, setting)
     yield add
     buffer, info = io.BytesIO(), setting.map_info
+    tags = [] if info is None else info.geotiff
+    if (nothing := _nothing(output)) is not None:
+        tags.append((_GDAL_NODATA, 2, len(str(nothing)) + 1, str(nothing), True))
     names = list(setting.channels.get(output.name, (output.name,)))
     with _require_tifffile().TiffWriter(buffer, bigtiff=planes.nbytes > _LARGEST_TIFF) as writer:
         writer.write(
@@ -371,7 +385,7 @@ def _tif(output: Output, path: Path, setting: RenderSetting) -> Iterator[RowsSin
             compression="zlib",
             description=json.dumps({"output": output.name, "what": output.what, "bands": names}),
             metadata=None,
-            extratags=[] if info is None else info.geotiff,
+            extratags=tags,
         )
     write_file(path, buffer.getvalue())
 
