@@ -107,6 +107,8 @@ SAID: dict[str, dict[str, Any]] = {
     "band names = {450 nm, 460 nm, red, 480 nm}": {"nm": None},
     "data ignore value = -9999 ; none measured": {"no_data": (-9999,)},
     "data ignore value = {-9999, 0}": {"no_data": (-9999, 0), "warnings": ()},
+    "radiance scale factor = 500": {"linear": None, "warning": "'radiance scale factor' is 500: not applied"},
+    "scale factor = {1.0}": {"linear": None, "warnings": ()},
     "data ignore value = unset": {"warning": "'data ignore value' is unset, no number: not used"},
     "sensor type = a\nsensor type = b\nwavelength = {400, 500, 600, 700}": {"nm": NM},
     "; by hand\n\nscale factor: 10000": {

@@ -140,6 +140,9 @@ def _described(file: SpectralFile, header_path: Path, header: dict[str, str]) ->
     if bands.wavelengths_nm is None and own.wavelengths_nm is not None:
         bands = replace(own, bad=own.bad if bands.bad is None else bands.bad)
     linear = state_linear(header_path, num_bands, header, "header field", _GAINS_AND_OFFSETS, warnings)
+    factors = [key for key in header if key.endswith("scale factor") and key != "reflectance scale factor"]
+    factors = [key for key in factors if header[key].strip("{} ") not in ("1", "1.0")]
+    warnings += [f"'{key}' is {header[key]}: not applied, as ENVI knows no such field" for key in factors]
     # Of Resonon, which writes decibels without saying so. Source: massipipe, RadianceConverter.
     in_db = header.keys() >= _OF_RESONON and "gain unit" not in header
     exposure = exposure_facts(header | ({"gain unit": "dB"} if in_db else {}), "header field", warnings)
