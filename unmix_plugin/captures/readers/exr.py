@@ -36,7 +36,7 @@ from unmix_plugin.limits import allow_decoded, allow_parts
 _HEADER_BYTES = 2**20
 _MARK = b"channels\0chlist\0"
 _TYPES = (np.dtype("u4"), np.dtype("f2"), np.dtype("f4"))
-_NUMBER = r"(\d+(?:[.,]\d+)?)"
+_NUMBER = r"(\d+(?:[.,]\d+)?(?:[Ee][+-]?\d+)?)"
 _LAYER = r"(?:(?P<layer>\D(?:.*\D)?|[ST]\d?)\.)?"
 _POWERS = {"": 0, "p": -12, "n": -9, "u": -6, "m": -3, "k": 3, "M": 6, "G": 9, "T": 12, "P": 15}
 _LENGTH = re.compile(rf"{_LAYER}{_NUMBER}([{''.join(_POWERS)}]?)m")
