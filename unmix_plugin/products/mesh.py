@@ -32,7 +32,7 @@ from unmix_plugin.products.scene_products import Mesh
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.segmentation import NOTHING_ID
 from unmix_plugin.trained.run_materials import endmember_colours
-from unmix_plugin.trained.run_views import directions_to_world, positions_for_files, world_up
+from unmix_plugin.trained.run_views import directions_to_world, gltf_positions, positions_for_files, world_up
 from unmix_plugin.trained.surface import SurfaceAppearance, look_from_above, property_names
 from unmix_plugin.trained.surface_mesh import TriangleMesh, surface_of
 from unmix_plugin.trained.trained_scene import TrainedScene
@@ -253,13 +253,8 @@ def gltf_content(
     extras: dict[str, Any] = {"materials": list(looks.materials.names), "about": looks.comments(what)[:3]}
     if looks.scale is not None:
         extras["metres_per_unit"] = looks.scale.metres_per_unit
-    vertices = mesh.vertices
-    if vertices.dtype == np.float64:
-        extent = max(float(np.ptp(vertices, axis=0).max()), 1e-12)
-        # Whole units, or as many digits as leave no more than about the extent, which float32 resolves.
-        extras["offset"] = np.round(vertices.mean(axis=0), max(0, -math.floor(math.log10(extent)))).tolist()
-        vertices = vertices - extras["offset"]
-    return vertices.astype(np.float32), numbers, extras
+    positions, offset = gltf_positions(mesh.vertices)
+    return positions, numbers, {**extras, **offset}
 
 
 def _paths(folder: Path, kind: str) -> list[Path]:

@@ -143,6 +143,19 @@ def positions_for_files(
     return world if rounding > _PRECISION * extent else world.astype(np.float32)
 
 
+def gltf_positions(
+    world: Float[np.ndarray, "*points 3"],
+) -> tuple[Float32[np.ndarray, "*points 3"], dict[str, list[float]]]:
+    """Positions of `positions_for_files` as float32, which glTF has alone, and what its extras say: the `offset` that
+    was taken from large ones."""
+    if world.dtype != np.float64:
+        return world.astype(np.float32), {}
+    extent = max(float(np.ptp(world, axis=0).max()), 1e-12)
+    # Whole units, or as many digits as leave no more than about the extent, which float32 resolves.
+    offset = np.round(world.mean(axis=0), max(0, -math.floor(math.log10(extent))))
+    return (world - offset).astype(np.float32), {"offset": offset.tolist()}
+
+
 def directions_to_world(
     frame: Normalisation, directions: Float[np.ndarray, "*points 3"]
 ) -> Float64[np.ndarray, "*points 3"]:

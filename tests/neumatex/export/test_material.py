@@ -81,6 +81,17 @@ def test_the_gltf_is_the_mesh_in_the_world_in_metres_where_the_scale_is_known(wr
     np.testing.assert_allclose(metres, 0.001 * np.asarray(loaded.vertices), atol=1e-7)
 
 
+def test_far_from_the_origin_the_gltf_keeps_positions_to_a_millionth_in_units_of_any_size(tmp_path):
+    mesh, frame = (
+        knot(),
+        Normalisation(np.eye(3), np.array([3.37, 5.21, 0.0]), 1000.0),
+    )  # an object of 2 mm, in m
+    write_material(tmp_path, mesh, PBR, frame, 256)
+    loaded, world = loaded_mesh(tmp_path / "material.glb"), frame.to_world(mesh.vertices.double().numpy())
+    found = np.float64(loaded.vertices)[loaded.faces] + loaded.metadata["offset"]
+    assert np.abs(found - world[mesh.faces.numpy()]).max() < 1e-6 * np.ptp(world, axis=0).max()
+
+
 def test_pictures_are_srgb_numbers_linear_and_both_are_what_the_report_says(written):
     numbers, picture = exr(written / "base_colour.exr"), png(written / "base_colour.png")
     assert numbers.shape == picture.shape == (256, 256, 3)

@@ -33,7 +33,7 @@ from unmix_plugin.spectral.colour.conversion import rgb_matrix
 from unmix_plugin.spectral.colour.srgb import encode_srgb
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 from unmix_plugin.spectral.materials import default_names
-from unmix_plugin.trained.run_views import directions_to_world, positions_for_files
+from unmix_plugin.trained.run_views import directions_to_world, gltf_positions, positions_for_files
 
 _TEXTURES = ("base_colour", "gltf_base_colour", "gltf_metallic_roughness")
 _NEURAL_TEXTURES = ("diffuse_colour", "latents_a", "latents_b")
@@ -203,12 +203,10 @@ def _write_glb(
 ) -> Path:
     """Write the mesh in world coordinates with base colour (sRGB) and metallic-roughness pictures."""
     world = positions_for_files(frame.to_world(mesh.vertices.cpu().double().numpy()))[atlas.vertices]
-    if world.dtype == np.float64:  # glTF has float32 only
-        extras = {**extras, "offset": np.round(world.mean(axis=0)).tolist()}
-        world = world - extras["offset"]
+    positions, offset = gltf_positions(world)
     normals = directions_to_world(frame, mesh.normals.cpu().double().numpy())[atlas.vertices]
-    geometry = (world.astype(np.float32), normals.astype(np.float32), atlas.uv, atlas.faces)
-    return write_textured_glb(path, *geometry, *pictures, extras)
+    geometry = (positions, normals.astype(np.float32), atlas.uv, atlas.faces)
+    return write_textured_glb(path, *geometry, *pictures, {**extras, **offset})
 
 
 def _report(
