@@ -90,6 +90,18 @@ def test_a_reference_of_any_name_is_no_view_by_whichever_of_its_files_it_is_name
     assert told[0] == f"{capture.root}: 4 views of the layout cubes"
 
 
+@pytest.mark.parametrize(("reflectance", "is_said"), [("1", False), ("0.5", True)])
+def test_values_that_saturate_far_below_1_are_said_to_be_written_as_it(
+    tmp_path, capture, reflectance, is_said
+):
+    for name in capture.reflectance:
+        counts = counts_of(capture.root / f"{name}.raw").copy()
+        counts[8:14, 8:14] = 4095
+        write_cube(capture.root, name, counts)
+    _, findings = made(tmp_path, capture, **references_of(capture), white_reflectance=reflectance)
+    assert any("values are saturated from 0." in finding for finding in findings) == is_said
+
+
 def test_poses_in_an_array_beside_the_cubes_are_no_view(tmp_path: Path, capture):
     frames = json.loads((capture.root / "transforms.json").read_text())["frames"]
     matrices = np.array([frame["transform_matrix"] for frame in frames])[:, :3]

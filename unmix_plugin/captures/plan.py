@@ -50,6 +50,8 @@ _MOST_ABOVE_ONE = 0.01
 """Share of reflectances above 1 that is still taken for highlights."""
 _LEAST_BRIGHT = 0.05
 """Bright values below this would lose digits if they were kept."""
+_LEAST_END = 0.9
+"""Of what is written as 1: saturated values below are too far off. Columns and bands differ in their ends a little."""
 _MOST_BELOW, _LEAST_LEVEL, _PILED_UP = 0.02, 0.005, 0.84
 """Share of a band's values below 0, and their mean over what is bright and over their root mean square, above which a
 level was taken off: of noise around black the last is 0.8, of a level 1."""
@@ -165,6 +167,12 @@ def make_plan(
     tables = filter(os.path.isfile, texts)
     warned = [warning for sensor in sensors.values() for warning in sensor.warnings]
     warned += _doubts_of_values([*sensors.values()], 1.0 if options.scale is not None else scale)
+    end = min(sensor.saturated_from for sensor in sensors.values())
+    if end < _LEAST_END * scale:
+        warned.append(
+            f"values are saturated from {end:.3g} on, and are written as 1, which is read as at least {scale:g}: "
+            f"expose less, or make that true with --scale {end:.3g}, which cuts off all above"
+        )
     each = [(view.name, file) for view in views for file in (view.cube, *view.references)]
     each += [(file.path.name, file) for file in opened]
     return Plan(

@@ -82,6 +82,10 @@ class Raster:
         """Whether a mark is in each square, (h * n, w * n, ...) to (h, w, ...)."""
         return marks if self.binning == 1 else np.any(self._squares(marks), axis=(1, 3))
 
+    def mostly_in_square(self, marks: np.ndarray) -> np.ndarray:
+        """Whether marks fill half of each square or more, (h * n, w * n, ...) to (h, w, ...)."""
+        return marks if self.binning == 1 else 2 * self._squares(marks).sum(axis=(1, 3)) >= self.binning**2
+
     def _squares(self, values: np.ndarray) -> np.ndarray:
         n = self.binning
         return values.reshape(len(values) // n, n, values.shape[1] // n, n, *values.shape[2:])
@@ -164,7 +168,7 @@ class Calibration:
             part = opacity[first * self.raster.binning : last * self.raster.binning, :, None]
             values *= part / np.float32(255.0)
             saturated &= part == 255
-        values, saturated = self.raster.averaged(values), self.raster.any_in_square(saturated)
+        values, saturated = self.raster.averaged(values), self.raster.mostly_in_square(saturated)
         if self.bin_bands > 1:
             values = self._in_bins(values).mean(axis=-1)
             saturated = np.any(self._in_bins(saturated), axis=-1)

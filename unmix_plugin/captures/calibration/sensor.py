@@ -56,7 +56,7 @@ _GAP, _LEFT_OUT = 3.0, 2.5
 and above which a range was left out: one band that is left out makes two steps of one, two make three."""
 _LEAST_WHITE = 0.01
 """Signal of the white reference in a band, as a share of the greatest, below which the band is too dark."""
-BRIGHT_PERCENTILE = 99.9
+BRIGHT_PERCENTILE, _FEW_PERCENTILE = 99.9, 5.0
 _MOST_REFLECTANCE = 1.5
 """Of bright pixels with highlights."""
 
@@ -147,6 +147,8 @@ class Sensor:
     """Whether a white reference or the files say what 1 is, which dividing values loses."""
     is_reflectance: bool = False
     """Whether values are reflectances, of which 1 is a white: by a white reference, or as the files say."""
+    saturated_from: float = np.inf
+    """Calibrated value of nearly the darkest of sampled numbers that are saturated."""
 
     @property
     def centers_nm(self) -> Float64[np.ndarray, " c"]:
@@ -204,6 +206,7 @@ def prepare_sensor(
     choice = choice.without_incomplete_bins(binning)
     choice.require(binning, str(first.path))
     still_kept = np.isin(calibration.bands, choice.kept)
+    at_end = sample[0][:, still_kept][sample[1][:, still_kept]]
     if lamp is not None:
         lamp = lamp[choice.kept].astype(np.float32).reshape(-1, binning).mean(axis=1).astype(np.float64)
         lamp = np.clip(lamp, 0.0, None) / lamp.max()
@@ -227,6 +230,7 @@ def prepare_sensor(
         tuple(warnings),
         bool(whites) or states_one,
         bool(whites) or (has_one and finished is not None),
+        float(np.percentile(at_end, _FEW_PERCENTILE)) if len(at_end) else np.inf,
     )
 
 
