@@ -92,6 +92,19 @@ def test_bands_without_wavelengths_are_numbered_and_pixels_without_measurement_l
     assert not open_spectral_file(tmp_path / "plain" / "abundances.hdr").read()[:4].any()
 
 
+def test_bands_that_were_measured_nowhere_are_left_out(cube, tmp_path):
+    cube[..., 5:8] = -9999
+    cube[:2] = -9999
+    bands = Bands.of(np.linspace(450, 900, cube.shape[2]))
+    write_envi_cube(tmp_path / "a", cube, bands, None, "a", {"data ignore value": -9999})
+    ended = done(image, tmp_path / "a.hdr", "--endmembers", 3, "--output-dir", tmp_path)
+    assert "3 bands left out" in ended.out
+    assert "40 pixels without a measurement" in ended.out
+    with (tmp_path / "a" / "endmembers.csv").open() as file:
+        found = [float(row[0]) for row in list(csv.reader(file))[1:]]
+    np.testing.assert_allclose(found, np.delete(bands.centers_nm, slice(5, 8)))
+
+
 def test_a_matrix_of_bands_and_pixels_is_an_image_by_its_size(cube, tmp_path):
     savemat(tmp_path / "list.mat", {"Y": cube.reshape(-1, 24, order="F").T})
     ended = done(image, tmp_path / "list.mat", "--size", 20, 20, "--endmembers", 3, "--output-dir", tmp_path)
@@ -147,7 +160,7 @@ def test_the_place_on_the_earth_is_kept_and_a_repeated_wavelength_left_out(cube,
     (tmp_path / "field.hdr").write_text(header.replace(f"{float(nm[3])!r},", f"{float(nm[2])!r},"))
     words = ["--endmembers", 3, "--mnf", 2, "--output-dir", tmp_path / "out"]
     ended = done(image, tmp_path / "field.hdr", *words)
-    assert "1 band left out: marked as bad in the file, or of a wavelength that is there twice" in ended.out
+    assert "1 band left out: marked as bad in the file, of a wavelength that is there twice" in ended.out
     for name in ("abundances", "confidence", "mnf"):
         assert open_spectral_file(tmp_path / "out" / "field" / f"{name}.hdr").metadata["map"] == on_map
 

@@ -64,6 +64,12 @@ def image(argv: list[str]) -> None:
     opened = open_spectral_file(options.file, options.for_readers())
     bands, wavelengths = _good_bands(opened)
     stored = opened.read(bands=bands)
+    # EnMAP has no numbers where the air lets no light through.
+    each = [find_missing(stored[..., [i]], opened, bands=bands[[i]]) for i in range(len(bands))]
+    measured = [i for i, missing in enumerate(each) if not missing.all()]
+    if 0 < len(measured) < len(bands):
+        bands, stored = bands[measured], stored[..., measured]
+        wavelengths = None if wavelengths is None else wavelengths[measured]
     mask = ~find_missing(stored, opened, bands=bands)
     cube = stated_values(opened, stored, slice(0, opened.shape[0]), bands)
     if (dark := own_dark_mean(opened)) is not None:
@@ -101,7 +107,7 @@ def _say_what_was_read(opened: SpectralFile, mask: np.ndarray, num_bands: int, i
     if is_compared and stated_reflectance(opened) is None:
         print(f"note: the file does not say that it holds reflectance. If it does not, {LIGHT_UNKNOWN}")
     if left_out := opened.shape[2] - num_bands:
-        why = "marked as bad in the file, or of a wavelength that is there twice"
+        why = "marked as bad in the file, of a wavelength that is there twice, or measured nowhere"
         print(f"{counted(left_out, 'band')} left out: {why}")
     if not mask.all():
         print(f"{counted(int((~mask).sum()), 'pixel')} without a measurement in every band left out")
