@@ -40,7 +40,7 @@ class _MaterialCount:
     """With 1, 2, ... materials: mean distance of pixels of length 1 to the nearest mixture of two of them, without what
     noise adds to it."""
     noise_distance: float
-    """Mean distance that noise alone would make."""
+    """Mean distance that noise alone would make; 0 where there are too few pixels or bands to know it."""
     signal_dimensions: int | None
     """What HySime counts; None where there are too few pixels or bands for it."""
 
@@ -52,9 +52,10 @@ class _MaterialCount:
             mark = "  <- proposed" if number == self.number else ""
             lines.append(f"{number:9d}  {distance:13.4f}  {1 - distance / max(before, 1e-12):12.0%}{mark}")
             before = distance
+        left_out = f"; noise, {self.noise_distance:.4f}, is left out" if self.noise_distance else ""
         lines.append(
             f"proposed: the last before one that takes away less than {_LEAST_SHARE:.0%} of the distance, or less than "
-            f"{_LEAST_FALL:g}; noise, {self.noise_distance:.4f}, is left out"
+            f"{_LEAST_FALL:g}{left_out}"
         )
         if self.signal_dimensions is not None:
             lines.append(f"HySime: {self.signal_dimensions} dimensions hold more signal than noise")
