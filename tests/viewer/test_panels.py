@@ -107,6 +107,11 @@ def test_a_range_of_ones_own_begins_as_it_was_and_stays_where_it_would_end_below
     page.set("own range", False)
     page.wait_until(lambda: np.abs(decoded(page.last_picture) - before).mean() < 1)
     assert not low["visible"]
+    page.set("own range")
+    page.wait_until(lambda: low["visible"])
+    show_layer(page, "abundance of one endmember")
+    page.wait_until(lambda: not page.props("own range")["value"] and not low["visible"])
+    assert session.view.settings.value_range is None
 
 
 def test_the_point_cloud_follows_the_light_and_shows_no_hidden_material(viewer, page, monkeypatch):

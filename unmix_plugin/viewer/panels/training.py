@@ -77,7 +77,9 @@ class TrainingPanel:
         if self._sure.value is True:
             self._control.request_stop()
         else:
-            self._session.say("stop?", "tick the box above first: training ends, saved, and can be resumed")
+            self._session.say(
+                "stop?", "tick the box above first: training is saved and ends, as does the viewer"
+            )
 
     def _change_share(self) -> None:
         device = self._control.device

@@ -125,7 +125,7 @@ class LayerPanel:
     def _add_range(self) -> None:
         """The ends of the colour map: the layer's, or one's own, which begin as they were."""
         own_range, hint = self._settings.value_range, "Choose the values at the ends of the colour map."
-        is_own = self._gui.add_checkbox("own range", own_range is not None, hint=hint)
+        is_own = self._own_range = self._gui.add_checkbox("own range", own_range is not None, hint=hint)
         ends = [
             self._gui.add_number(label, value, step=1e-4)
             for label, value in zip(("low", "high"), own_range or (0.0, 1.0), strict=True)
@@ -168,6 +168,7 @@ class LayerPanel:
         if setting in ("layer", "value_range"):
             self._show_controls()
         if setting == "layer":
+            self._own_range.value = False  # such ends mean nothing of other values
             self._session.say_busy(layer_named(self._settings.layer, self._layers).title)
         self._session.services.loop.change(self._session.view, settings=self._settings)
 
