@@ -164,6 +164,13 @@ def test_bands_in_which_the_white_is_saturated_are_left_out_and_said(tmp_path: P
     np.testing.assert_allclose(scene.cube(0), expected, atol=1.0 / 1000)
 
 
+def test_a_band_that_the_white_marks_as_bad_is_left_out(tmp_path: Path, capture):
+    marks = {"bbl": "{1, 1, 1, 0, 1, 1, 1, 1, 1}"}
+    write_cube(capture.root, "white", counts_of(capture.root / "white.raw"), header=marks)
+    scene, _ = made(tmp_path, capture, **references_of(capture))
+    np.testing.assert_array_equal(scene.wavelengths_nm, np.delete(WAVELENGTHS_NM, 3))
+
+
 @pytest.mark.parametrize("has_file", [False, True])
 def test_dark_lines_of_a_file_are_its_dark_frame_where_it_has_no_other(tmp_path, capture, has_file: bool):
     """Specim's line cameras close the shutter for the last lines; poses and masks may be made for all of them."""

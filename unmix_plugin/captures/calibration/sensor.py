@@ -347,7 +347,7 @@ def _stored_pixels(file: SpectralFile, row: int, bands: BandIndex = slice(None))
 def _lit_bands(
     choice: _BandChoice, white: Reference, saturation: float | None, warnings: list[str]
 ) -> _BandChoice:
-    """The choice without bands in which a white reference is saturated or has no light."""
+    """The choice without bands in which a white reference is saturated, marked as bad, or has no light."""
     clipped, path = _clipped_bands(white, saturation), white.file.path
     advice = "take it again with a shorter exposure"
     if clipped.mean() > _MOST_SATURATED_WHITE:
@@ -358,6 +358,8 @@ def _lit_bands(
             f"{path.name}: the white is saturated in {listed}: these bands are left out; {advice}"
         )
     choice = choice.without(clipped, "the white reference is saturated there")
+    if white.file.bands.bad is not None:
+        choice = choice.without(white.file.bands.bad, "marked as bad in the white reference")
     is_dark = white.signal < _LEAST_WHITE * white.signal.max()
     return choice.without(is_dark, "the white reference has no light there")
 
