@@ -234,14 +234,14 @@ def _spectral_facts(materials: Materials | None, recorded: Sequence[float] | Non
         return {**empty, "light": None, "is_light_known": False, "colour_map": _colour_map()}
     bands, power = materials.bands, _light_of(materials)
     endmembers = materials.endmembers.detach().cpu().double().numpy()
-    own, shown = "the scene's own", materials.light_name
+    own, shown, dark = "the scene's own", materials.light_name, list[str]()
     lights = [{"name": shown or own, "factors": [1.0] * len(bands), "notes": []}]
     if shown is not None and materials.sensor is None:  # whose channels the recorded light is not known in
         assert power is not None
         before = np.ones(len(bands)) if recorded is None else np.array(recorded, dtype=np.float64)
         back = relit(np.ones(len(bands)), power.tolist(), before)
-        notes = [f"black where {shown} does not reach"] if not materials.is_lit.all() else []
-        lights.append({"name": own, "factors": rounded(back), "notes": notes})
+        dark = [f"black where {shown} does not reach"] if not materials.is_lit.all() else []
+        lights.append({"name": own, "factors": rounded(back), "notes": dark})
     for light in _LIGHTS if materials.sensor is None else ():  # a light is lit before a sensor looks
         if light == shown:
             continue
@@ -249,6 +249,7 @@ def _spectral_facts(materials: Materials | None, recorded: Sequence[float] | Non
             factors, notes = relighting_factors(bands, power, Light(light))
         except SpectrumError:
             continue  # it does not reach these bands: not offered
+        notes = [*dark, *notes[len(dark) :]]  # the first takes the light shown for the scene's own
         lights.append({"name": light, "factors": rounded(factors), "notes": notes})
     return {
         "wavelengths_nm": rounded(bands.centers_nm),
