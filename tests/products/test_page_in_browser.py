@@ -23,6 +23,7 @@ from tests.products.ball_page import NAMES, SCALE, SCENE, TITLE, WORLD_RADIUS, e
 from tests.trained.camera_scenes import FRAME
 from unmix_plugin.formats.libraries import library_of
 from unmix_plugin.products.page import page
+from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.features import absorption, continuum_removed
 from unmix_plugin.trained.run_views import RunView
 from unmix_plugin.trained.surface_mesh import vertex_areas
@@ -112,6 +113,14 @@ def assert_layers_match_and_differ(scene, opened):
     assert (opened.inner_text("#head h1"), opened.title()) == (TITLE, TITLE)
     opened.evaluate("(unmixPage.state.formula = 'r650 +', unmixPage.choose('index'))")
     assert "the formula ends too early" in opened.inner_text("#about")
+
+
+def test_colours_that_no_eye_sees_are_not_called_true(browser, tmp_path):
+    infrared = replace(SCENE.materials, bands=Bands.of(SCENE.bands.centers_nm + 500))
+    _, _, path = export(tmp_path, replace(SCENE, materials=infrared), regions={})
+    with looking(browser, path) as shown:
+        assert "false colour of all bands" in shown.locator("#layer").inner_text()
+        assert "true colour" not in shown.locator("#layer").inner_text()
 
 
 def test_the_legend_of_materials_has_their_areas(opened):

@@ -243,7 +243,7 @@
   // ---- layers -------------------------------------------------------------------------------------------------------
   const state = { layer: "colour", band: Math.floor(B / 2), false: [5, 3, 1].map((part) => Math.floor((part * B) / 6)), material: 0, index: 0, formula: "" };
   const layers = [
-    ["colour", relit ? "colour in a light" : "true colour"], ...(relit ? [["base", "base colour"], ["roughness", "roughness"], ["metallicity", "metallicity"]] : []),
+    ["colour", relit ? "colour in a light" : facts.colour.startsWith("true") ? "true colour" : "false colour of all bands"], ...(relit ? [["base", "base colour"], ["roughness", "roughness"], ["metallicity", "metallicity"]] : []),
     ...(B ? [["band", "one band"], ["false", "false colour"], ["abundance", "abundance of a material"], ["materials", "materials"]] : []),
     ...(confidence ? [["confidence", "confidence in the material"]] : []), ...(B ? [["index", "spectral index"]] : []),
   ];
