@@ -177,6 +177,9 @@ def test_a_white_that_was_taken_once_serves_all_views_and_gaps_are_refused(tmp_p
         reflectances(tmp_path)
     for path in tmp_path.glob("tree/21[35]/capture/WHITEREF*"):
         path.unlink()
+    assert "of their own, which is used for all unless --white" in str(
+        find_cubes(tmp_path / "tree", PLAIN).notes
+    )
     for index, values in enumerate(reflectances(tmp_path)[0]):
         np.testing.assert_allclose(values, (1000 + 100 * index) / 2000, atol=1e-4)
 

@@ -133,7 +133,8 @@ def _capture_of_groups(root: Path, folders: dict[Path, list[Path]], options: Rea
     views = _open_views(names, paths, own, there, options)
     counts = Counter(reference for references in own for reference in references)
     notes = [
-        f"{counts[kind]} of {len(views)} views have a {what}, which is used unless {flag} names another"
+        f"{counts[kind]} of {len(views)} views have a {what}, which is used{' for all' * (counts[kind] == 1)} unless "
+        f"{flag} names another"
         for kind, (what, flag) in _OWN.items()
         if counts[kind]
     ]
