@@ -296,6 +296,13 @@ def test_parts_of_hdf5_that_were_never_written_are_missing(
     assert missing[:4].any() == (chunks is None)
 
 
+def test_two_marks_that_are_no_number_are_one(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        image = file.create_dataset("cube", data=CUBE.astype("f4"), fillvalue=np.nan)
+        image.attrs.update({"_FillValue": np.float32(np.nan), "missing_value": np.float64(np.nan)})
+    assert len(open_spectral_file(tmp_path / "a.h5").no_data) == 1
+
+
 def test_numbers_of_hdf5_outside_the_file_are_not_followed(tmp_path):
     (tmp_path / "secret").write_bytes(bytes(range(60)))
     with h5py.File(tmp_path / "a.h5", "w") as file:

@@ -439,6 +439,7 @@ def _measured_numbers(
         valid = valid and (valid[0] + more * (valid[0] < 0), valid[1] + more * (valid[1] < 0))
     elif image.fill is not None and image.fill != 0 and (dtype.kind == "f" or image.fill < 0):
         no_data.append(image.fill)  # other numbers may be light
+    no_data = [np.nan if np.isnan(number) else number for number in no_data]  # of which one is like another
     return dtype, tuple(dict.fromkeys(no_data)), valid
 
 
