@@ -87,6 +87,14 @@ def test_a_name_that_means_nothing_is_refused_with_what_could_be_meant(name, mes
         SCENE.output(name)
 
 
+def test_colours_of_bands_that_no_eye_sees_are_said_to_be_false():
+    scene = make_scene()
+    infrared = replace(scene.materials, bands=Bands.of(scene.bands.centers_nm + 500))
+    for name in ("rgb", "linear_rgb"):
+        assert "false colour" not in scene.output(name).what
+        assert "0 to 1; false colour: red " in replace(scene, materials=infrared).output(name).what
+
+
 def test_bands_are_told_by_the_wavelength_that_is_shown_and_refused_before_anything_is_rendered(monkeypatch):
     band, exact = SCENE.output("band:530nm"), SCENE.output("band:550nm")
     assert band.what.endswith(": 550 nm (asked: 530 nm)")

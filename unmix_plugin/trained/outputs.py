@@ -20,7 +20,13 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.registry import Output, OutputKind, no_output
 from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.colour.conversion import band_composite_matrix, linear_to_srgb, rgb_matrix
+from unmix_plugin.spectral.colour.conversion import (
+    band_composite_matrix,
+    colour_mode,
+    describe_colour,
+    linear_to_srgb,
+    rgb_matrix,
+)
 from unmix_plugin.spectral.features import FEWEST_BANDS, continuum_removed, derivative_matrix
 from unmix_plugin.spectral.materials import Coefficients, Materials
 from unmix_plugin.spectral.segmentation import material_scores
@@ -366,7 +372,10 @@ def available_outputs(materials: Materials) -> tuple[MaterialOutput, ...]:
 
 
 def _told(output: MaterialOutput, materials: Materials) -> MaterialOutput:
-    """An output with the right words for its spectra: reflectance where a white is 1 in every band, else radiance."""
+    """An output with the right words for its spectra, reflectance where a white is 1 in every band, else radiance, and
+    for its colours, where they are false."""
+    if output.kind in ("srgb", "linear") and colour_mode(materials.bands) == "false-colour":
+        return replace(output, what=f"{output.what}; {describe_colour(materials.bands)}")
     if output.kind == "channels" and materials.quantity == "reflectance":
         return replace(output, what=output.what.replace("radiance", "reflectance"))
     if output.kind != "spectra":
