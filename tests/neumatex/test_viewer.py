@@ -111,7 +111,10 @@ def test_a_click_reads_the_numbers_of_the_light_that_is_shown(source):
         with source.borrowed() as scene:
             lit = relit(scene, light, "neumatex").probe(camera, camera.width // 2, camera.height // 2)
             plain = scene.probe(camera, camera.width // 2, camera.height // 2)
-    assert _first_numbers(lit.values["linear_rgb"]) in page.texts
+        assert _first_numbers(lit.values["linear_rgb"]) in page.texts
+        page.set("brightness (stops)", 0.0)
+        page.wait_for_text("The light has changed")
+        assert "linear_rgb" not in page.texts
     assert _first_numbers(lit.values["linear_rgb"]) != _first_numbers(plain.values["linear_rgb"])
 
 

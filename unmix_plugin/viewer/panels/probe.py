@@ -273,6 +273,10 @@ class ValuesPanel:
         self._session = session
         add_click_switch(session, "probe where I click", self._take)
         self._text = session.client.gui.add_html(paragraph(_INVITATION))
+        session.on_edit.append(self._forget)
+
+    def _forget(self) -> None:
+        self._text.content = paragraph(f"The light has changed. {_INVITATION}")
 
     def _take(self, camera: Cameras, place: tuple[float, float]) -> None:
         with self._session.services.maker.shown_turn(self._session.view.edit) as (_, shown):

@@ -205,6 +205,8 @@ class LightPanel:
         light = LightChoice(name, number_of(self._rotation, 0.0), number_of(self._exposure, 0.0))
         view = self._session.view
         self._session.services.loop.change(view, edit=Edit(view.edit.recipe, light))
+        for tell in self._session.on_edit:
+            tell()
 
 
 _HEIGHT_STEP = 16
