@@ -283,7 +283,7 @@ def test_odd_formulas_still_have_a_scale_and_a_short_label(frame, aids):
         assert (legend.low, legend.high) == (0.0, 1.0)
         assert ("; undefined wherever something is" in legend.label) == (formula[:3] == "log")
     _, legend = painted(frame, aids, "index", index="+".join(["r650"] * 90))
-    assert len(legend.label) < 160
+    assert len(legend.label) < 240
     assert "..." in legend.label
 
 
