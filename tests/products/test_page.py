@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.captures.file_factory import present
 from tests.products.ball_page import SCENE, export
 from unmix_plugin.editing import Light, Recipe, edit_scene
 from unmix_plugin.editing.apply import with_sensor
@@ -94,7 +95,9 @@ def test_a_relit_page_names_the_light_that_it_shows_and_offers_the_recorded_one(
     spectra = relit.endmembers.numpy() * np.array(own["factors"])
     np.testing.assert_allclose(spectra, scene.materials.endmembers.numpy(), rtol=1e-4)
     assert "A" not in [one["name"] for one in others]
-    ends = replace(relit, light=relit.light.clone().index_fill(0, torch.tensor([count - 1]), 0.0))
+    light = present(relit.light).clone()
+    light[-1] = 0.0
+    ends = replace(relit, light=light)
     for one in page._spectral_facts(ends, recorded.tolist())["lights"][1:]:
         assert one["notes"][0] == "black where A does not reach"
         assert not any("own light" in note for note in one["notes"])

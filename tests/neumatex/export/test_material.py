@@ -82,13 +82,10 @@ def test_the_gltf_is_the_mesh_in_the_world_in_metres_where_the_scale_is_known(wr
 
 
 def test_far_from_the_origin_the_gltf_keeps_positions_to_a_millionth_in_units_of_any_size(tmp_path):
-    mesh, frame = (
-        knot(),
-        Normalisation(np.eye(3), np.array([3.37, 5.21, 0.0]), 1000.0),
-    )  # an object of 2 mm, in m
+    mesh, frame = knot(), Normalisation(np.eye(3), np.array([3.37, 5.21, 0.0]), 1000.0)  # of 2 mm, in metres
     write_material(tmp_path, mesh, PBR, frame, 256)
     loaded, world = loaded_mesh(tmp_path / "material.glb"), frame.to_world(mesh.vertices.double().numpy())
-    found = np.float64(loaded.vertices)[loaded.faces] + loaded.metadata["offset"]
+    found = np.asarray(loaded.vertices, np.float64)[loaded.faces] + loaded.metadata["offset"]
     assert np.abs(found - world[mesh.faces.numpy()]).max() < 1e-6 * np.ptp(world, axis=0).max()
 
 
