@@ -79,6 +79,11 @@ class BandTable:
     names: tuple[str, ...] | None = None
     """What the file calls its bands."""
 
+    def marking(self, *bad: Bool[np.ndarray, " B"] | None) -> BandTable:
+        """The table in which these bands are bad too, where there are such marks."""
+        marks = [one for one in (self.bad, *bad) if one is not None]
+        return replace(self, bad=np.any(marks, axis=0)) if marks else self
+
     @property
     def is_broad(self) -> Bool[np.ndarray, " B"]:
         """Which bands are too broad to have one wavelength; none where wavelengths or widths are unknown."""

@@ -196,7 +196,7 @@ def judge_backdrop(
     # all; what an edge of the pictures cuts off between two corners, such as the foot of an object, stands before it.
     owners = np.array([index for index, view in enumerate(fitted) for _ in view.surfaces])
     near = norm(levels[:, None] - levels[None]) < _MOST_UNLIKE * brightest
-    has_corner = np.array([each.has_corner for view in fitted for each in view.surfaces])
+    has_corner = np.array([has for view in fitted for has in view.have_corners()])
     supported = [
         len(set(owners[row])) >= _MOST_VIEWS * len(images) and has_corner[row].mean() >= _LEAST_CORNERS
         for row in near

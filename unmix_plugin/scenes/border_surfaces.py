@@ -58,8 +58,6 @@ class _Surface:
     """Distance up to which a pixel belongs to it."""
     level: Float32[np.ndarray, " k"]
     """Median features of its pixels."""
-    has_corner: bool = False
-    """Whether it shows in a corner of the picture."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +69,18 @@ class FittedView:
     farthest: float
     """Distance beyond which no pixel belongs to any."""
     known: Mask
+
+    def have_corners(self) -> list[bool]:
+        """Which of the surfaces show in most of a corner of the picture."""
+        shape, found = self.known.shape, np.zeros(len(self.surfaces), bool)
+        terms = _terms(shape).reshape(*shape, -1)
+        rows, columns = (max(1, round(BORDER_SHARE * side)) for side in shape)
+        for corner in (np.s_[y, x] for y in np.s_[:rows, -rows:] for x in np.s_[:columns, -columns:]):
+            seen, own = self.features[corner], terms[corner]
+            away = [norm(seen - own @ each.coefficients) / each.tolerance for each in self.surfaces]
+            nearest = np.min(away, axis=0, initial=1.0)
+            found |= [bool((one <= nearest).mean() > 0.5) for one in away]
+        return found.tolist()
 
     def look(self) -> LookedAt:
         """Which pixels show the surfaces, and what they look like at each.
@@ -198,21 +208,7 @@ def fit_surfaces(features: Features, known: Mask, brightest: float) -> FittedVie
         parts = parts_of(alike)
         members = np.flatnonzero(np.isin(parts, parts[at_border]) & alike)
         unexplained = border[~alike.ravel()[border]]
-    if surfaces:
-        _note_corners(surfaces, features)
     return FittedView(features, surfaces, farthest, known)
-
-
-def _note_corners(surfaces: list[_Surface], features: Features) -> None:
-    """Note which surfaces show in most of a corner of the picture."""
-    terms = _terms(features.shape[:2]).reshape(*features.shape[:2], -1)
-    rows, columns = (max(1, round(BORDER_SHARE * side)) for side in features.shape[:2])
-    for corner in (np.s_[y, x] for y in np.s_[:rows, -rows:] for x in np.s_[:columns, -columns:]):
-        seen, own = features[corner], terms[corner]
-        away = np.array([norm(seen - own @ each.coefficients) / each.tolerance for each in surfaces])
-        shares = ((away <= 1) & (away <= away.min(axis=0))).mean(axis=(1, 2))
-        for surface, share in zip(surfaces, shares.tolist(), strict=True):
-            surface.has_corner |= share > 0.5
 
 
 def _border_surfaces(

@@ -341,10 +341,14 @@ class Session:
     def change_edit(self, edit: Edit) -> None:
         """Show the scene with other materials or light; an UnmixError if the edit does not fit: nothing changes."""
         notes = self.services.maker.edited(edit).notes
+        self.show_edit(edit)
+        self._show_notes(notes)
+
+    def show_edit(self, edit: Edit) -> None:
+        """The same of an edit that is known to fit; panels are told of it."""
         self.services.loop.change(self.view, edit=edit)
         for tell in self.on_edit:
             tell()
-        self._show_notes(notes)
 
     def show_objects(self, owner: str, has_some: bool) -> None:
         """Note whether a panel shows objects of the browser's own, which need depth to be hidden behind the picture."""

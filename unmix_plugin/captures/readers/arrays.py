@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from math import prod
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -183,10 +183,11 @@ def image_of_arrays(
 
 def _without_windows(table: BandTable, image: FoundArray) -> BandTable:
     """The table with bands marked as bad where the air lets no light through, by NEON's `Band_Window_1_Nanometers`."""
-    nm, marks = table.wavelengths_nm, [] if table.bad is None else [table.bad]
+    nm = table.wavelengths_nm
     windows = [_numbers(value) for key, value in image.all_attributes.items() if _WINDOW.fullmatch(key)]
-    marks += [(nm >= min(ends)) & (nm <= max(ends)) for ends in windows if nm is not None and ends]
-    return replace(table, bad=np.any(marks, axis=0) if marks else None)
+    return table.marking(
+        *((nm >= min(ends)) & (nm <= max(ends)) for ends in windows if nm is not None and ends)
+    )
 
 
 def choose_axes(
@@ -295,11 +296,10 @@ def _entries(arrays: Sequence[FoundArray], image: FoundArray) -> dict[str, Any]:
     entries = {key: value for key, value in attributes.items() if not says_bands(key.lower())}
     entries |= _lists_beside(arrays, image)
     for key in sorted(attributes, key=words_apart):
-        values = np.atleast_1d(
-            _numbers_in_text(attributes[key]) if says_bands(key.lower()) else attributes[key]
-        )
+        is_of_bands = says_bands(key.lower())
+        values = np.atleast_1d(_numbers_in_text(attributes[key]) if is_of_bands else attributes[key])
         kinds = _NUMBERS + "b" * bool(GOOD.fullmatch(key.lower()))
-        if says_bands(key.lower()) and values.dtype.kind in _TEXTS and len(values) in image.shape:
+        if is_of_bands and values.dtype.kind in _TEXTS and len(values) in image.shape:
             entries.setdefault("band names", values)
         if values.ndim == 1 and values.dtype.kind in kinds and len(values) in image.shape:
             entries.setdefault(key, values)

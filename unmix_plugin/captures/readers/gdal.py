@@ -12,10 +12,8 @@ from pathlib import Path
 from typing import Any, TypeAlias
 from xml.etree.ElementTree import Element
 
-import numpy as np
-
 from unmix_plugin.captures.header_values import check_bands, plain_names, state_bands, state_linear
-from unmix_plugin.captures.spectral_file import BandTable, Linear, SpectralFile
+from unmix_plugin.captures.spectral_file import Linear, SpectralFile
 from unmix_plugin.errors import counted
 from unmix_plugin.limits import parse_xml, read_bounded
 
@@ -136,11 +134,8 @@ def _with_xml(file: SpectralFile, found: Path, warnings: list[str]) -> SpectralF
     unit = {} if found.name.endswith(".aux.xml") else {"wavelength_units": "nm"}
     stated = state_bands(gdal_entries(of_all) | unit, found.name)
     if bands.wavelengths_nm is None and (stated.centres or stated.names):
-        table = check_bands(stated, num_bands, warnings)
-        marks = [bad for bad in (table.bad, bands.bad) if bad is not None]
-        bad = np.any(marks, axis=0) if marks else None
-        names = table.names if bands.names is None else bands.names
-        bands = BandTable(table.wavelengths_nm, table.evidence, table.fwhm_nm, bad, names)
+        table = check_bands(stated, num_bands, warnings).marking(bands.bad)
+        bands = replace(table, names=table.names if bands.names is None else bands.names)
     linear = file.linear or gdal_linear(file.path, items, num_bands, found.name, warnings)
     if linear is not None and quantity:
         linear = replace(linear, evidence=f"{linear.evidence} of {quantity}")

@@ -136,13 +136,9 @@ class RegionsPanel:
 
         threading.Thread(target=work, name="unmix-viewer-region", daemon=True).start()
 
-    @property
-    def _choices(self) -> tuple[str, ...]:
-        return (*_NO_REGION, *self._session.services.regions.kept)
-
     def _list(self, chosen: str) -> None:
         """Show the names of what is kept, and what one of them is, if it is kept still."""
-        names = self._choices
+        names = (*_NO_REGION, *self._session.services.regions.kept)
         self._chosen.options = names
         self._chosen.value = chosen if chosen in names else _NO_REGION[0]
         self._show_chosen()

@@ -203,10 +203,7 @@ class LightPanel:
     def _change(self) -> None:
         name = choice(self._name.value, self._session.services.lights[1:], None)
         light = LightChoice(name, number_of(self._rotation, 0.0), number_of(self._exposure, 0.0))
-        view = self._session.view
-        self._session.services.loop.change(view, edit=Edit(view.edit.recipe, light))
-        for tell in self._session.on_edit:
-            tell()
+        self._session.show_edit(Edit(self._session.view.edit.recipe, light))
 
 
 _HEIGHT_STEP = 16
