@@ -12,9 +12,10 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 from tests.scenes.scene_factory import look_at
-from unmix_plugin.captures.checks import SeenView, _overlap, check_views, report_text
+from unmix_plugin.captures.checks import SeenView, _overlap, check_views
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet
+from unmix_plugin.captures.report import report_text
 from unmix_plugin.captures.writing.scene_files import _OUTLINE, _contact_sheet
 from unmix_plugin.captures.writing.view_files import ViewRecord, _detail
 from unmix_plugin.spectral.colour.srgb import encode_srgb

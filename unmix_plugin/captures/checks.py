@@ -12,7 +12,6 @@ Notation: `H x W` pixels, `N` views, `P` points.
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -53,7 +52,6 @@ _MOST_CHANGE = 0.7
 """Logarithm of a ratio beyond which a pixel shows another surface."""
 _LEAST_SLOPE, _CERTAINTY = 0.15, 4.0
 """Slopes below, up or down, count as none; standard errors of the slope that are beyond doubt."""
-_WIDTH = 110
 
 _Points = Float64[np.ndarray, "P 3"]
 
@@ -133,20 +131,6 @@ def check_views(views: Sequence[SeenView], points: _Points | None, findings: lis
         )
     _pixels(views, findings)
     return [check(views, points, findings) for check in (_ring, _overlap, _blur, _exposure, _moving_light)]
-
-
-def report_text(title: str, findings: Sequence[str], measured: Sequence[str], done: Sequence[str]) -> str:
-    """One page of text: what looks wrong, what was measured, what was done."""
-    wrong, parts = findings or ["none of the checks found a fault"], [title, ""]
-    headings = ("What looks wrong", "What was measured", "What was done")
-    for heading, lines in zip(headings, (wrong, measured, done), strict=True):
-        parts.append(heading)
-        parts += [
-            textwrap.fill(line, _WIDTH, initial_indent="- ", subsequent_indent="  ", break_long_words=False)
-            for line in lines
-        ]
-        parts.append("")
-    return "\n".join(parts)
 
 
 def angles_between(views: Sequence[SeenView]) -> Float64[np.ndarray, "N N"]:

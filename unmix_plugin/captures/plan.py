@@ -25,6 +25,7 @@ from unmix_plugin.captures.calibration.sensor import (
 from unmix_plugin.captures.camera_tags import radiometric_model
 from unmix_plugin.captures.options import MaskKind, ProcessOptions, plain_options
 from unmix_plugin.captures.poses.pose_set import reading
+from unmix_plugin.captures.report import Code, Kind, Remark, sentences
 from unmix_plugin.captures.spectral_file import Capture, CaptureView, SpectralFile
 from unmix_plugin.captures.writing.view_files import BackgroundRule, ViewRecipe, alpha_picture
 from unmix_plugin.errors import CaptureError, ConfigError, name_some
@@ -393,11 +394,13 @@ def _files_of(paths: Iterable[Path]) -> Iterator[Path]:
 
 def _warnings_of_files(files: Sequence[tuple[str, SpectralFile | None]]) -> list[str]:
     """What files warn of; one sentence where several warn of the same."""
-    names: dict[str, list[str]] = defaultdict(list)
-    for name, file in files:
-        for warning in () if file is None else file.warnings:
-            names[warning].append(name)
-    return [f"{name_some(where)}: {warning}" for warning, where in names.items()]
+    found = [
+        Remark.of(Code.FILE_WARNING, [name], text=text)
+        for name, file in files
+        if file
+        for text in file.warnings
+    ]
+    return sentences(found, Kind.WRONG)
 
 
 def _notes_on_pictures(files: Sequence[SpectralFile]) -> list[str]:
