@@ -10,11 +10,12 @@ BENCHMARKS := $(filter-out benchmarks/fuzz_guided.py,$(sort $(wildcard benchmark
 MINIMUM := .venv-minimum
 MINIMUM_TESTS := tests/engine tests/spectral tests/editing tests/formats tests/scenes tests/figures tests/viewer/test_server.py tests/captures/readers
 
-.PHONY: demo test test-all test-minimum test-portable wheel platforms audit lint format bench notebooks site clean help
+.PHONY: demo test cases test-all test-minimum test-portable wheel platforms audit lint format bench notebooks site clean help
 
 help:
 	@echo "make demo    train on the built-in scene, evaluate, export abundance maps and a page to share"
 	@echo "make test    run the tests, less the slow ones"
+	@echo "make cases   run those of the tests that read files as other people's programs write them"
 	@echo "make test-all   run every test, and check each shape annotation while they run"
 	@echo "make test-minimum   run the core of the tests on the lowest versions that are allowed"
 	@echo "make test-portable   run the tests, less the slow ones, with what only POSIX has taken away"
@@ -52,6 +53,10 @@ $(VENV)/.system-packages: scripts/install_system_packages.sh | $(BIN)/python
 
 test: $(VENV)/.installed-dev $(VENV)/.system-packages
 	$(BIN)/python -m pytest --numprocesses 2 -m "not slow"
+
+# A part of `make test`, in less than a minute.
+cases: $(VENV)/.installed-dev
+	$(BIN)/python -m pytest tests/cases
 
 test-all: $(VENV)/.installed-dev $(VENV)/.system-packages
 	$(BIN)/python -m pytest --numprocesses 2 --jaxtyping-packages=unmix_plugin,beartype.beartype

@@ -1,0 +1,353 @@
+"""Cubes as cameras and programs write them: each is read with its right values, or refused with the right cause."""
+
+from __future__ import annotations
+
+import h5py
+import numpy as np
+import OpenEXR
+import pytest
+import tifffile
+from PIL import Image
+
+from tests.captures.file_factory import gdal_items, gdal_tag
+from tests.cases.inputs import (
+    HEIGHT,
+    RED_GREEN_BLUE,
+    VIEWS,
+    WAVELENGTHS_NM,
+    WIDTH,
+    braced,
+    counts,
+    cube,
+    cube_of,
+    not_processed,
+    number_of,
+    pose_of,
+    processed,
+    ring,
+    write_envi,
+    write_transforms,
+)
+
+GAIN, OFFSET = np.linspace(1e-4, 4e-5, 7), np.linspace(-0.1, -0.02, 7)
+LAMP = np.linspace(9000, 14000, 7)
+NAMES = [f"view_{index:03d}" for index in range(VIEWS)]
+
+
+def cubes(root, *words, output, poses="transforms.json"):
+    return processed("cubes", "--data", root, "--poses", poses, *words, output=output)
+
+
+@pytest.mark.parametrize("kind", ["envi", "tiff"])
+def test_a_gain_and_an_offset_a_band_are_applied(kind, tmp_path):
+    root = tmp_path / "capture"
+    root.mkdir()
+    for index, name in enumerate(NAMES):
+        stored = np.clip(np.rint((cube(index) - OFFSET) / GAIN), 0, 65535).astype(np.uint16)
+        if kind == "envi":
+            linear = {"data_gain_values": braced(GAIN), "data_offset_values": braced(OFFSET)}
+            write_envi(root / f"{name}.hdr", stored, "bsq", suffix=".img", **linear)
+        else:
+            tag = gdal_tag(
+                gdal_items("WAVELENGTH", WAVELENGTHS_NM),
+                gdal_items("WAVELENGTH_UNITS", ["Nanometers"] * 7),
+                gdal_items("OFFSET", OFFSET, ' role="offset"'),
+                gdal_items("SCALE", GAIN, ' role="scale"'),
+            )
+            planes = np.moveaxis(stored, -1, 0)
+            tifffile.imwrite(
+                root / f"{name}.tif", planes, planarconfig="separate", photometric="minisblack", extratags=tag
+            )
+    write_transforms(root / "transforms.json", NAMES)
+    cubes(root, output=tmp_path / "scene").check_values(cube_of)
+
+
+def test_integration_times_of_headers_are_divided_out(tmp_path):
+    root = tmp_path / "capture"
+    for index, name in enumerate(NAMES):
+        tint = 20.0 if index % 2 else 10.0
+        write_envi(root / f"{name}.hdr", counts(cube(index), LAMP * tint / 5, 200), tint=tint)
+    write_envi(root / "white.hdr", counts(np.ones((8, WIDTH, 7)), LAMP, 200), tint=5.0)
+    write_envi(root / "dark.hdr", counts(np.zeros((8, WIDTH, 7)), LAMP, 200), tint=20.0)
+    write_transforms(root / "transforms.json", NAMES)
+    references = "--white", root / "white.hdr", "--dark", root / "dark.hdr"
+    cubes(root, *references, output=tmp_path / "scene").check_values(cube_of, 0.01)
+
+
+def test_views_of_a_lumo_tree_have_their_own_references(tmp_path):
+    for index in range(VIEWS):
+        folder, name = tmp_path / "capture" / f"{212 + index}" / "capture", f"{212 + index}"
+        lamp = LAMP * (1 + 0.1 * index)
+        write_envi(folder / f"{name}.hdr", counts(cube(index), lamp, 300), tint=10)
+        write_envi(folder / f"WHITEREF_{name}.hdr", counts(np.ones((8, WIDTH, 7)), lamp, 300), tint=10)
+        write_envi(folder / f"DARKREF_{name}.hdr", counts(np.zeros((8, WIDTH, 7)), lamp, 300), tint=10)
+        (folder.parent / "manifest.xml").write_text("<manifest/>")
+    write_transforms(tmp_path / "poses.json", [f"{212 + index}.hdr" for index in range(VIEWS)])
+    scene = cubes(tmp_path / "capture", output=tmp_path / "scene", poses=tmp_path / "poses.json")
+    assert len(scene.views) == VIEWS
+    scene.check_values(lambda name: cube(number_of(name) - 212), 0.01)
+
+
+def exr(path, channels, **header):
+    usual = {
+        "compression": OpenEXR.ZIP_COMPRESSION,
+        "type": OpenEXR.scanlineimage,
+        "spectralLayoutVersion": "1.0",
+    }
+    OpenEXR.File({**usual, **header}, channels).write(str(path))
+
+
+def spectral(layer, values, gain=1.0):
+    """Channels of a layer (H, W, B)."""
+    names = [f"{layer}." + f"{nm:.6f}nm".replace(".", ",") for nm in WAVELENGTHS_NM]
+    return {name: np.ascontiguousarray(values[..., b] * gain, np.float32) for b, name in enumerate(names)}
+
+
+def rgb(values):
+    return {key: np.ascontiguousarray(values[..., b]) for key, b in zip("RGB", RED_GREEN_BLUE, strict=True)}
+
+
+def test_the_parts_of_an_exr_are_joined(tmp_path):
+    for index, name in enumerate(NAMES):
+        values = cube(index).astype(np.float32)
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+        parts = [
+            OpenEXR.Part({**header, "name": "preview"}, rgb(values)),
+            OpenEXR.Part({**header, "name": "spectral"}, spectral("S0", values)),
+        ]
+        OpenEXR.File(parts).write(str(tmp_path / f"{name}.exr"))
+    write_transforms(tmp_path / "transforms.json", NAMES)
+    scene = cubes(tmp_path, output=tmp_path / "scene")
+    assert len(scene.wavelengths_nm) == 7
+    scene.check_values(cube_of)
+
+
+def more_layers(kind, values):
+    """Channels beside those that count."""
+    plane, names = np.full((HEIGHT, WIDTH), 7.0, np.float32), list(spectral("T", values))
+    if kind == "bispectral":
+        return spectral("T", values) | {
+            f"{a}.{b[2:]}": plane for i, a in enumerate(names) for b in names[i + 1 :]
+        }
+    stokes = {
+        key: one
+        for s, gain in enumerate((1, 0.3, -0.2, 0.01))
+        for key, one in spectral(f"S{s}", values, gain).items()
+    }
+    return stokes if kind == "polarised" else stokes | spectral("T", np.full_like(values, 0.5))
+
+
+@pytest.mark.parametrize("kind", ["bispectral", "polarised", "polarised and reflective"])
+def test_the_layer_that_a_spectral_exr_means_is_taken(kind, tmp_path):
+    for index, name in enumerate(NAMES):
+        values = cube(index).astype(np.float32)
+        exr(tmp_path / f"{name}.exr", rgb(values) | more_layers(kind, values))
+    write_transforms(tmp_path / "transforms.json", NAMES)
+    cubes(tmp_path, output=tmp_path / "scene").check_values(cube_of)
+
+
+def test_a_header_beside_a_tiff_describes_it(tmp_path):
+    for index, name in enumerate(NAMES):
+        planes = np.moveaxis(cube(index).astype(np.float32), -1, 0)
+        tifffile.imwrite(tmp_path / f"{name}.tif", planes, planarconfig="separate", photometric="minisblack")
+        entries = {"samples": WIDTH, "lines": HEIGHT, "bands": 7, "file type": "TIFF", "data type": 4}
+        entries |= {
+            "interleave": "bsq",
+            "wavelength": braced(WAVELENGTHS_NM / 1000),
+            "bbl": "{1,1,1,1,0,1,1}",
+        }
+        entries |= {"byte order": 0, "wavelength units": "Micrometers"}
+        lines = "".join(f"{key} = {value}\n" for key, value in entries.items())
+        (tmp_path / f"{name}.hdr").write_text(f"ENVI\n{lines}")
+    write_transforms(tmp_path / "transforms.json", NAMES)
+    scene = cubes(tmp_path, output=tmp_path / "scene")
+    np.testing.assert_allclose(scene.wavelengths_nm, np.delete(WAVELENGTHS_NM, 4))
+    scene.check_values(lambda name: np.delete(cube_of(name), 4, axis=2))
+
+
+def shape_of(index):
+    return (HEIGHT, WIDTH) if index % 2 else (WIDTH, HEIGHT)
+
+
+def test_upright_and_lying_pictures_make_one_scene(tmp_path):
+    for index, name in enumerate(NAMES):
+        write_envi(tmp_path / f"{name}.hdr", cube(index, *shape_of(index)).astype(np.float32))
+
+    def lens(index):
+        height, width = shape_of(index)
+        return {"w": width, "h": height, "cx": width / 2, "cy": height / 2}
+
+    write_transforms(tmp_path / "transforms.json", NAMES, of_frame=lens)
+    scene = cubes(tmp_path, output=tmp_path / "scene")
+    scene.check_values(lambda name: cube(number_of(name), *shape_of(number_of(name))))
+    scene.check_poses(pose_of)
+
+
+def test_bands_are_put_in_order(tmp_path):
+    nm = np.array([980, 900, 820, 700, 620, 460, 1050, 990, 900.0])
+    bad, kept = 4, [5, 3, 2, 1, 0, 7, 6]
+    for index, name in enumerate(NAMES):
+        stored = np.rint(cube(index, nm=nm) * 10000).astype(">u2")
+        good = braced(int(band != bad) for band in range(9))
+        write_envi(
+            tmp_path / f"{name}.hdr",
+            stored,
+            "bsq",
+            wavelength=braced(nm),
+            bbl=good,
+            reflectance_scale_factor=10000,
+        )
+    write_transforms(tmp_path / "transforms.json", NAMES)
+    scene = cubes(tmp_path, output=tmp_path / "scene")
+    np.testing.assert_allclose(scene.wavelengths_nm, nm[kept])
+    scene.check_values(lambda name: cube(number_of(name), nm=nm)[..., kept])
+
+
+LISTED, LISTED_UM = braced(WAVELENGTHS_NM, "{:g}"), braced(WAVELENGTHS_NM / 1000, "{:g}")
+BASE = (
+    f"ENVI\nsamples = {WIDTH}\nlines = {HEIGHT}\nbands = 7\nheader offset = 0\nfile type = ENVI Standard\n"
+    "data type = 4\ninterleave = bil\nbyte order = 0\n"
+)
+ODD_HEADERS = {
+    "micro sign in Latin-1": (f"{BASE}wavelength units = \xb5m\nwavelength = {LISTED_UM}\n", "latin-1"),
+    "an underscore": (f"{BASE}wavelength_units = Nanometers\nwavelength = {LISTED}\n", "utf-8"),
+    "unit misspelt": (f"{BASE}wavelength_unts = Micrometers\nwavelength = {LISTED_UM}\n", "utf-8"),
+    "unit unknown": (f"{BASE}wavelength units = Unknown\nwavelength = {LISTED_UM}\n", "utf-8"),
+    "nested brackets": (
+        f"{BASE}description = {{A[B],[C]}}\nwavelength units = nm\nwavelength = {LISTED}\n",
+        "utf-8",
+    ),
+    "tabs and CRLF": (
+        f"{BASE}wavelength units = nm\nwavelength = {LISTED}\n".replace(" = ", "\t=\t").replace("\n", "\r\n"),
+        "utf-8",
+    ),
+    "capitals": (
+        f"{BASE}WAVELENGTH UNITS = NANOMETERS\nWAVELENGTH = {LISTED}\n".replace("samples", "SAMPLES"),
+        "utf-8",
+    ),
+    "UTF-16": (f"{BASE}wavelength units = nm\nwavelength = {LISTED}\n", "utf-16"),
+}
+
+
+@pytest.mark.parametrize("kind", ODD_HEADERS)
+def test_odd_headers_are_read(kind, tmp_path):
+    text, encoding = ODD_HEADERS[kind]
+    for index, name in enumerate(NAMES):
+        (tmp_path / f"{name}.hdr").write_bytes(text.encode(encoding))
+        (tmp_path / f"{name}.raw").write_bytes(cube(index).astype(np.float32).transpose(0, 2, 1).tobytes())
+    write_transforms(tmp_path / "transforms.json", NAMES)
+    scene = cubes(tmp_path, output=tmp_path / "scene")
+    np.testing.assert_allclose(scene.wavelengths_nm, WAVELENGTHS_NM, rtol=1e-4)
+    scene.check_values(cube_of)
+
+
+def write_array(kind, path, values):
+    match kind:
+        case "fortran.npy":
+            np.save(path, np.asfortranarray(values))
+        case "big-endian.npy":
+            np.save(path, values.astype(">f4"))
+        case "cube.npz":
+            np.savez(path, cube=values, wavelengths=WAVELENGTHS_NM)
+        case "prisma.he5":
+            with h5py.File(path, "w") as file:
+                fields = file.create_group("HDFEOS/SWATHS/PRS_L2D_HCO/Data Fields")
+                fields["VNIR_Cube"] = np.rint(values[..., ::-1] * 65535).astype(np.uint16).transpose(0, 2, 1)
+                fields["SWIR_Cube"] = np.zeros((HEIGHT, 5, WIDTH), np.uint16)
+                file.attrs["List_Cw_Vnir"] = WAVELENGTHS_NM[::-1].astype(np.float32)
+                file.attrs["List_Cw_Swir"] = np.array([2400, 2000, 1500, 1000, 0], np.float32)
+        case "emit.nc":
+            with h5py.File(path, "w") as file:
+                file["reflectance"] = values
+                file["sensor_band_parameters/wavelengths"] = WAVELENGTHS_NM
+                file["location/lat"] = np.zeros((HEIGHT, WIDTH))
+        case "neon.h5":
+            with h5py.File(path, "w") as file:
+                stored = np.rint(values * 10000).astype(np.int16)
+                data = file.create_dataset("SITE/Reflectance/Reflectance_Data", data=stored)
+                data.attrs["Scale_Factor"] = 10000.0
+                file["SITE/Reflectance/Metadata/Spectral_Data/Wavelength"] = WAVELENGTHS_NM
+        case "arad.mat" | "icvl.mat":
+            with h5py.File(path, "w", userblock_size=512) as file:
+                file["cube" if kind == "arad.mat" else "rad"], file["bands"] = (
+                    values.T,
+                    WAVELENGTHS_NM[:, None],
+                )
+            with path.open("r+b") as file:
+                file.write(b"MATLAB 7.3 MAT-file, Platform: PCWIN64".ljust(124) + b"\x00\x02IM")
+
+
+@pytest.mark.parametrize("unit", ["Wavenumber", "cm-1", "Index"])
+def test_a_list_in_another_unit_gives_no_wavelengths(unit, tmp_path):
+    for index, name in enumerate(NAMES):
+        numbers = braced(1e7 / WAVELENGTHS_NM) if unit != "Index" else braced(range(1, 8))
+        write_envi(
+            tmp_path / f"{name}.hdr",
+            cube(index).astype(np.float32),
+            wavelength=numbers,
+            wavelength_units=unit,
+        )
+    write_transforms(tmp_path / "transforms.json", NAMES)
+    message = not_processed(
+        "cubes", "--data", tmp_path, "--poses", "transforms.json", output=tmp_path / "scene"
+    )
+    assert "the wavelengths of its 7 bands are unknown" in message
+
+
+@pytest.mark.parametrize(
+    "kind",
+    ["fortran.npy", "big-endian.npy", "cube.npz", "prisma.he5", "emit.nc", "neon.h5", "arad.mat", "icvl.mat"],
+)
+def test_arrays_are_read_in_the_order_of_their_axes(kind, tmp_path):
+    suffix = kind.partition(".")[2]
+    for index, name in enumerate(NAMES):
+        write_array(kind, tmp_path / f"{name}.{suffix}", cube(index).astype(np.float32))
+    write_transforms(tmp_path / "transforms.json", NAMES)
+    words = ["--dataset", "VNIR_Cube"] if suffix == "he5" else []
+    words += ["--wavelengths", ",".join(f"{nm:g}" for nm in WAVELENGTHS_NM)] if suffix == "npy" else []
+    scene = cubes(tmp_path, *words, output=tmp_path / "scene")
+    np.testing.assert_allclose(scene.wavelengths_nm, WAVELENGTHS_NM, rtol=1e-6)
+    scene.check_values(cube_of)
+
+
+def test_a_scan_that_was_cut_is_not_taken_for_views(tmp_path):
+    for index in range(VIEWS):
+        stored = counts(cube(index), LAMP, 90)
+        for name, rows in (("raw_0", stored[:14]), ("raw_14", stored[14:])):
+            write_envi(tmp_path / f"scan_{index:02d}" / f"{name}.hdr", rows)
+    write_transforms(tmp_path / "transforms.json", [f"scan_{index:02d}/raw_0.hdr" for index in range(VIEWS)])
+    message = not_processed(
+        "cubes", "--data", tmp_path, "--poses", "transforms.json", output=tmp_path / "scene"
+    )
+    assert f"{WIDTH} x 14" in message
+
+
+def test_a_mosaic_has_no_wavelength(tmp_path):
+    nm = np.linspace(460, 630, 16)
+    for index, name in enumerate(NAMES):
+        mosaic = np.zeros((4 * HEIGHT, 4 * WIDTH), np.uint16)
+        for band, plane in enumerate(np.moveaxis(np.rint(cube(index, nm=nm) * 1000), -1, 0)):
+            mosaic[band // 4 :: 4, band % 4 :: 4] = plane
+        Image.fromarray(mosaic).save(tmp_path / f"{name}.png")
+    write_transforms(tmp_path / "transforms.json", NAMES, w=4 * WIDTH, h=4 * HEIGHT)
+    message = not_processed(
+        "cubes", "--data", tmp_path, "--poses", "transforms.json", output=tmp_path / "scene"
+    )
+    assert "wavelengths of its 1 bands are unknown" in message
+
+
+def test_previews_beside_cubes_are_named(tmp_path):
+    names = [f"session_{index:03d}_cube" for index in range(VIEWS)]
+    for index, name in enumerate(names):
+        stored = np.rint(cube(index) * 10000).astype(np.uint16)
+        told = "wavelengths = " + ", ".join(f"{nm:g}" for nm in WAVELENGTHS_NM)
+        planes = np.moveaxis(stored, -1, 0)
+        tifffile.imwrite(tmp_path / f"{name}.tiff", planes, photometric="minisblack", description=told)
+        tifffile.imwrite(
+            tmp_path / f"session_{index:03d}_pan.tiff", np.kron(stored[..., 0], np.ones((2, 2), np.uint16))
+        )
+    write_transforms(tmp_path / "transforms.json", names, ring(VIEWS))
+    message = not_processed(
+        "cubes", "--data", tmp_path, "--poses", "transforms.json", output=tmp_path / "scene"
+    )
+    assert "session_000_pan.tiff" in message

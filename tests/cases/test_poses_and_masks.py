@@ -1,0 +1,255 @@
+"""Poses, lenses and masks of other programs: each is read as that program means it, or refused by its cause."""
+
+from __future__ import annotations
+
+import json
+import struct
+import unicodedata
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from tests.cases.inputs import (
+    FOCAL_PX,
+    HEIGHT,
+    RED_GREEN_BLUE,
+    RGB,
+    VIEWS,
+    WIDTH,
+    cube,
+    cube_of,
+    not_processed,
+    pose_of,
+    processed,
+    ring,
+    write_envi,
+    write_transforms,
+)
+
+CUBES = [f"view_{index:03d}" for index in range(VIEWS)]
+PICTURES = [f"{index:04d}" for index in range(VIEWS)]
+Y, X = np.mgrid[:HEIGHT, :WIDTH]
+DISC = (Y - HEIGHT / 2) ** 2 + (X - WIDTH / 2) ** 2 < 9**2
+
+
+def write_cubes(root: Path, names=CUBES) -> None:
+    for index, name in enumerate(names):
+        write_envi(root / f"{name}.hdr", cube(index).astype(np.float32))
+
+
+def write_pictures(root: Path) -> None:
+    (root / "images").mkdir(parents=True)
+    for index, name in enumerate(PICTURES):
+        picture = np.rint(cube(index)[..., RED_GREEN_BLUE] * 255).astype(np.uint8)
+        Image.fromarray(picture).save(root / f"images/{name}.png")
+
+
+def rays_of_a_fisheye(focal_px, terms):
+    """Where pixels of a 9 x 9 grid are, and their rays on the plane at depth 1, under OpenCV's fisheye model."""
+    v, u = np.mgrid[0:1:9j, 0:1:9j] * np.array([HEIGHT, WIDTH])[:, None, None]
+    radius = np.hypot(u - WIDTH / 2, v - HEIGHT / 2) / focal_px
+    angle = radius
+    for _ in range(60):
+        angle = radius / (1 + sum(term * angle ** (2 * power + 2) for power, term in enumerate(terms)))
+    around = np.arctan2(v - HEIGHT / 2, u - WIDTH / 2)
+    return u, v, np.tan(angle) * np.cos(around), np.tan(angle) * np.sin(around)
+
+
+def test_a_fisheye_of_instant_ngp_keeps_its_rays(tmp_path):
+    focal_px, terms = 18.0, (0.01, -0.004, 0.001, 0.0)
+    write_cubes(tmp_path)
+    named = dict(zip(("k1", "k2", "k3", "k4"), terms, strict=True))
+    write_transforms(
+        tmp_path / "transforms.json",
+        [f"./{name}.hdr" for name in CUBES],
+        focal_px=focal_px,
+        is_fisheye=True,
+        **named,
+    )
+    scene = processed("cubes", "--data", tmp_path, "--poses", "transforms.json", output=tmp_path / "scene")
+    lens = scene.views[0].entries
+    u, v, x, y = rays_of_a_fisheye(focal_px, terms)
+    k1, k2, k3, k4, p1, p2 = (float(lens.get(key) or 0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    r2 = x**2 + y**2
+    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3 + k4 * r2**4
+    found_u = lens["fl_x"] * (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2)) + lens["cx"]
+    found_v = lens["fl_y"] * (y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y) + lens["cy"]
+    assert np.hypot(found_u - u, found_v - v).max() < 0.6
+
+
+@pytest.mark.parametrize("before", ["images\\", ".\\images\\"])
+def test_a_backslash_is_a_slash(before, tmp_path):
+    write_pictures(tmp_path)
+    write_transforms(tmp_path / "transforms.json", [f"{before}{name}.png" for name in PICTURES])
+    scene = processed("nerfstudio", "--data", tmp_path, *RGB, output=tmp_path / "scene")
+    assert len(scene.views) == VIEWS
+    scene.check_poses(pose_of)
+
+
+def test_an_offset_of_instant_ngp_moves_nothing(tmp_path):
+    write_cubes(tmp_path)
+    hints = {"aabb_scale": 1, "scale": 0.5, "offset": [0.5, 0.5, 0.5]}
+    write_transforms(tmp_path / "transforms.json", [f"{name}.hdr" for name in CUBES], **hints)
+    scene = processed("cubes", "--data", tmp_path, "--poses", "transforms.json", output=tmp_path / "scene")
+    scene.check_poses(pose_of)
+
+
+def to_colmap(pose):
+    """Quaternion (w, x, y, z) and translation of world to camera in OpenCV's axes."""
+    rotation = (pose[:3, :3] @ np.diag([1.0, -1.0, -1.0])).T
+    x, y, z, w = Rotation.from_matrix(rotation).as_quat()
+    return (w, x, y, z, *(-rotation @ pose[:3, 3]))
+
+
+def write_model(folder: Path, count: int) -> None:
+    """A binary COLMAP model of the first views."""
+    folder.mkdir(parents=True)
+    camera = struct.pack("<IiQQ4d", 1, 1, WIDTH, HEIGHT, FOCAL_PX, FOCAL_PX, WIDTH / 2, HEIGHT / 2)
+    (folder / "cameras.bin").write_bytes(struct.pack("<Q", 1) + camera)
+    images = struct.pack("<Q", count)
+    for index, pose in enumerate(ring()[:count]):
+        images += struct.pack("<I7dI", index + 1, *to_colmap(pose), 1)
+        images += CUBES[index].encode() + b".png\0" + struct.pack("<Q", 0)
+    (folder / "images.bin").write_bytes(images)
+    (folder / "points3D.bin").write_bytes(struct.pack("<Q", 0))
+
+
+def test_the_largest_model_of_hloc_is_taken(tmp_path):
+    write_cubes(tmp_path)
+    for folder, count in {"0": 3, "0/models/0": 3, "0/models/1": VIEWS}.items():
+        write_model(tmp_path / "colmap/sparse" / folder, count)
+    scene = processed("cubes", "--data", tmp_path, "--poses", tmp_path, output=tmp_path / "scene")
+    assert len(scene.views) == VIEWS
+    scene.check_poses(pose_of)
+
+
+@pytest.mark.parametrize("between", ["\n", "", "10.5 11.5 1 20 21 -1\n", "\r\n"])
+def test_every_line_of_images_txt_is_read(between, tmp_path):
+    names = [f"view {index:03d}" for index in range(VIEWS)]
+    write_cubes(tmp_path, names)
+    end = "\r\n" if between == "\r\n" else "\n"
+    model = tmp_path / "sparse/0"
+    model.mkdir(parents=True)
+    camera = f"1 PINHOLE {WIDTH} {HEIGHT} {FOCAL_PX} {FOCAL_PX} {WIDTH / 2} {HEIGHT / 2}{end}"
+    (model / "cameras.txt").write_text(camera, newline="")
+    lines = f"# Image list with two lines of data per image:{end}"
+    for index, (name, pose) in enumerate(zip(names, ring(), strict=True)):
+        lines += (
+            " ".join(f"{one:.12g}" for one in (index + 1, *to_colmap(pose), 1)) + f" {name}.png{end}{between}"
+        )
+    (model / "images.txt").write_text(lines, newline="")
+    (model / "points3D.txt").write_text("")
+    scene = processed("cubes", "--data", tmp_path, "--poses", "sparse/0", output=tmp_path / "scene")
+    assert len(scene.views) == VIEWS
+    scene.check_poses(pose_of)
+
+
+@pytest.mark.parametrize("kind", ["with a mark of its order", "decomposed", "UTF-16"])
+def test_names_in_other_forms_of_unicode_are_found(kind, tmp_path):
+    root = tmp_path / "Größe 1"
+    names = [unicodedata.normalize("NFC", f"Prüfling {index:03d}") for index in range(VIEWS)]
+    write_cubes(root, names)
+    write_transforms(root / "transforms.json", [f"{name}.hdr" for name in names])
+    text = json.dumps(json.loads((root / "transforms.json").read_text()), ensure_ascii=False)
+    text = unicodedata.normalize("NFD", text) if kind == "decomposed" else text
+    encoding = {"UTF-16": "utf-16", "decomposed": "utf-8"}.get(kind, "utf-8-sig")
+    (root / "transforms.json").write_text(text, encoding=encoding)
+    scene = processed("cubes", "--data", root, "--poses", "transforms.json", output=tmp_path / "scene")
+    assert len(scene.views) == VIEWS
+    scene.check_poses(pose_of)
+    scene.check_values(cube_of)
+
+
+def mask_picture(kind):
+    """A mask of the disc as programs write it."""
+    match kind:
+        case "0 and 255":
+            return Image.fromarray((DISC * 255).astype(np.uint8))
+        case "0 and 1":
+            return Image.fromarray(DISC.astype(np.uint8))
+        case "one bit":
+            return Image.fromarray(DISC)
+        case "a palette":
+            picture = Image.fromarray(DISC.astype(np.uint8), "P")
+            picture.putpalette([0, 0, 0, 255, 255, 255, *[0] * 750])
+            return picture
+        case "16 bits":
+            return Image.fromarray(DISC.astype(np.uint16) * 65535)
+    return Image.fromarray(np.dstack([DISC * 255] * 3 + [np.full_like(X, 255)]).astype(np.uint8), "RGBA")
+
+
+def check_disc(scene):
+    """That the alpha of every view is the disc."""
+    for view in scene.views:
+        with Image.open(scene.root / view.entries["file_path"]) as picture:
+            alpha = np.asarray(picture.convert("RGBA"))[..., 3]
+        np.testing.assert_array_equal(alpha > 127, DISC)
+
+
+@pytest.mark.parametrize(
+    "kind", ["0 and 255", "0 and 1", "one bit", "a palette", "16 bits", "opaque colours"]
+)
+@pytest.mark.filterwarnings("ignore:'mode' parameter is deprecated:DeprecationWarning")
+def test_a_mask_of_any_kind_is_the_disc_that_it_shows(kind, tmp_path):
+    write_pictures(tmp_path)
+    (tmp_path / "masks").mkdir()
+    for name in PICTURES:
+        mask_picture(kind).save(tmp_path / f"masks/{name}.png")
+    names = [f"images/{name}.png" for name in PICTURES]
+    write_transforms(
+        tmp_path / "transforms.json",
+        names,
+        of_frame=lambda index: {"mask_path": f"masks/{PICTURES[index]}.png"},
+    )
+    scene = processed("nerfstudio", "--data", tmp_path, *RGB, "--mask", "files", output=tmp_path / "scene")
+    check_disc(scene)
+
+
+@pytest.mark.parametrize("after", [".png.png", ".mask.png"])
+def test_a_mask_that_is_not_found_is_missed(after, tmp_path):
+    write_pictures(tmp_path)
+    (tmp_path / "masks").mkdir()
+    for name in PICTURES:
+        mask_picture("0 and 255").save(tmp_path / f"masks/{name}{after}")
+    write_transforms(tmp_path / "transforms.json", [f"images/{name}.png" for name in PICTURES])
+    words = "nerfstudio", "--data", tmp_path, *RGB, "--mask", "files"
+    assert "view 0000 has no mask" in not_processed(*words, output=tmp_path / "scene")
+
+
+def test_the_poses_of_realitycapture_are_not_taken_for_others(tmp_path):
+    write_cubes(tmp_path)
+    rows = ["#cameras 5", "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2"]
+    for name, pose in zip(CUBES, ring(), strict=True):
+        heading, pitch, roll = Rotation.from_matrix(pose[:3, :3]).as_euler("ZXY", degrees=True)
+        entries = *pose[:3, 3], -heading, pitch, roll, 45 * 36 / WIDTH, *[0] * 8
+        rows.append(f"{name}.png," + ",".join(f"{one:.9f}" for one in entries))
+    (tmp_path / "rc.csv").write_text("\n".join(rows) + "\n")
+    words = "cubes", "--data", tmp_path, "--poses", "rc.csv"
+    assert "rc.csv holds no poses that we know" in not_processed(*words, output=tmp_path / "scene")
+
+
+def test_lenses_of_metashape_whose_place_is_not_read_are_named(tmp_path):
+    """Their views are left out rather than put where the first lens of the system is."""
+    names = [f"{lens}_{index:03d}" for index in range(VIEWS) for lens in "LR"]
+    write_cubes(tmp_path, names)
+    shots = ""
+    for index, pose in enumerate(ring()):
+        turned = " ".join(f"{one:.12g}" for one in (pose @ np.diag([1.0, -1, -1, 1])).ravel())
+        shots += f'<camera id="{2 * index}" sensor_id="0" label="L_{index:03d}">'
+        shots += f"<transform>{turned}</transform></camera>"
+        shots += f'<camera id="{2 * index + 1}" sensor_id="1" master_id="{2 * index}" label="R_{index:03d}"/>'
+    size = f'<resolution width="{WIDTH}" height="{HEIGHT}"/>'
+    lens = f'{size}<calibration type="frame" class="adjusted">{size}<f>{FOCAL_PX}</f><cx>0</cx><cy>0</cy></calibration>'
+    (tmp_path / "cameras.xml").write_text(
+        '<?xml version="1.0" encoding="UTF-8"?><document version="2.0.0"><chunk label="1" enabled="true"><sensors>'
+        f'<sensor id="0" type="frame">{lens}</sensor><sensor id="1" type="frame" master_id="0">{lens}'
+        "<rotation>1 0 0 0 1 0 0 0 1</rotation><location>0.35 0 0</location></sensor></sensors>"
+        f"<cameras>{shots}</cameras></chunk></document>"
+    )
+    scene = processed("cubes", "--data", tmp_path, "--poses", "cameras.xml", output=tmp_path / "scene")
+    assert {view.name for view in scene.views} == {f"L_{index:03d}" for index in range(VIEWS)}
+    scene.check_poses(pose_of)
+    assert "R_000, R_001, R_002" in scene.printed
