@@ -3,6 +3,7 @@
 import asyncio
 import base64
 import contextlib
+import gzip
 import math
 import socket
 import threading
@@ -13,19 +14,22 @@ from typing import Any
 
 import msgspec
 import pytest
-import viser
-import websockets
+import websockets.asyncio.server
 from hypothesis import given
 from hypothesis import strategies as st
-from viser import infra
 from websockets.exceptions import InvalidStatus
 
 from tests.viewer.pages import has_control, opened, page_of, serving, show_layer
 from tests.viewer.view_factory import make_source
 from unmix_plugin.engine.training.progress import TrainingStatus
 from unmix_plugin.engine.training.training_control import TrainingControl
+from unmix_plugin.errors import ConfigError
+from unmix_plugin.spectral.maps.indices import parse_formula
 from unmix_plugin.viewer import connections
+from unmix_plugin.viewer.authentication import Authentication
 from unmix_plugin.viewer.connections import _Connection, _is_heard
+
+SERVE = websockets.asyncio.server.serve
 
 
 def test_stopping_frees_the_port_and_every_thread_and_prints_nothing(source, capsys):
@@ -51,6 +55,18 @@ def test_a_taken_port_is_passed_over_and_said(viewer, tmp_path):
         assert lines[1] == f"port {viewer.port} is taken, hence {second.port}"
         with opened(second):
             pass
+
+
+def test_pages_that_are_opened_at_once_are_all_served(tmp_path):
+    parse_formula.cache_clear()  # they are parsed for each page's menu of indices
+    with serving(make_source(tmp_path)) as (viewer, lines), contextlib.ExitStack() as stack:
+        pages = [stack.enter_context(page_of(viewer)) for _ in range(6)]
+        for page in pages:
+            page.look_from(0.3)
+        for page in pages:
+            page.wait_until(lambda page=page: bool(page.pictures) and has_control(page, "render a video"))
+            assert "could not be served" not in page.texts
+        assert len(lines) == 1
 
 
 def test_the_training_panel_steers_the_training(tmp_path):
@@ -134,8 +150,8 @@ def test_a_page_that_sends_nonsense_loses_its_connection_and_others_go_on(viewer
 
 
 def test_no_more_pages_are_served_than_there_is_room_for(viewer, monkeypatch):
-    monkeypatch.setattr("unmix_plugin.viewer.gate.MOST_PAGES", 1)
-    monkeypatch.setattr("unmix_plugin.viewer.gate._ROOM_S", 0.1)
+    monkeypatch.setattr("unmix_plugin.viewer.authentication.MOST_PAGES", 1)
+    monkeypatch.setattr("unmix_plugin.viewer.authentication._ROOM_S", 0.1)
     with opened(viewer):
         assert refused(viewer) == 503
     with opened(viewer):  # which waits until the one before has gone
@@ -153,9 +169,9 @@ def coded(word):
     return {"Authorization": "Basic " + base64.b64encode(f":{word}".encode()).decode()}
 
 
-def read(viewer, headers=None):
+def read(viewer, headers=None, path=""):
     """Status, headers and text of the page that a browser would load."""
-    asking = urllib.request.Request(f"http://127.0.0.1:{viewer.port}/", headers=headers or {})
+    asking = urllib.request.Request(f"http://127.0.0.1:{viewer.port}/{path}", headers=headers or {})
     try:
         answer = urllib.request.urlopen(asking)
     except urllib.error.HTTPError as error:
@@ -180,7 +196,7 @@ def guarded(tmp_path_factory):
 
 def test_a_page_must_give_the_token_before_it_sees_anything(guarded):
     status, _, text = read(guarded)
-    assert (status, "asks for the token" in text, "__viser" in text) == (401, True, False)
+    assert (status, "asks for the token" in text, '<div id="root">' in text) == (401, True, False)
     assert read(guarded, coded("barley"))[0] == 401
     assert refused(guarded) == refused(guarded, headers=coded("barley")) == 401
     assert guarded.num_clients == 0
@@ -308,14 +324,45 @@ def test_what_a_page_uploads_is_not_kept_and_nobody_can_ask_for_a_public_tunnel(
     assert tunnels == []
 
 
-def test_the_private_parts_are_those_of_the_version_that_they_were_taken_from(viewer):
-    assert viser.__version__.startswith("1.1."), (
-        "read connections.py beside the source of this viser, then name it here"
+def test_viser_itself_is_left_as_it_is_and_its_server_is_ours(viewer):
+    assert websockets.asyncio.server.serve is SERVE
+    with opened(viewer) as page:
+        page.send_raw(b"\xff")  # which viser itself would answer with a traceback
+        page.wait_until(lambda: page.is_closed)
+
+
+def test_a_version_of_viser_that_cannot_be_guarded_is_refused(monkeypatch):
+    own = SimpleNamespace(asyncio=SimpleNamespace(server=SimpleNamespace(serve=SERVE)), datastructures=None)
+    monkeypatch.setattr("viser.infra._infra.websockets", own)  # which then never asks for ours
+    before = set(threading.enumerate())
+    with pytest.raises(ConfigError, match=r"in a way that the viewer can't guard; install viser 1\.1"):
+        connections.open_server("127.0.0.1", 0, Authentication("127.0.0.1", None), lambda _: None)
+    for thread in set(threading.enumerate()) - before:
+        thread.join(20)
+        assert not thread.is_alive(), thread
+    assert websockets.asyncio.server.serve is SERVE
+
+
+@pytest.mark.parametrize("path", ["", "index.html", "?darkMode", "assets/no.js", "../secret", "%2e%2e/x"])
+def test_no_page_of_another_site_can_show_the_viewer_in_a_frame(viewer, guarded, path):
+    for one, headers in (
+        (viewer, {}),
+        (guarded, {}),
+        (guarded, coded("barley")),
+        (viewer, {"Host": "evil.example"}),
+    ):
+        status, answered, text = read(one, headers, path)
+        assert answered["Content-Security-Policy"] == "frame-ancestors 'self'"
+        assert answered["X-Frame-Options"] == "SAMEORIGIN"
+        assert ('<div id="root">' in text) is (status == 200)
+    assert read(viewer, path=path)[0] == (404 if "/" in path else 200)
+
+
+def test_the_page_comes_compressed_where_the_browser_takes_that(viewer):
+    asking = urllib.request.Request(
+        f"http://127.0.0.1:{viewer.port}/", headers={"Accept-Encoding": "gzip, br"}
     )
-    assert vars(infra._infra)["websockets"] is websockets  # viser itself is left as it is
-    server = viewer._server
-    assert server._websock_server._background_event_loop is server._event_loop
-    assert isinstance(server._websock_server, connections._PageServer)
-    with opened(viewer):
-        (connection,) = server._websock_server._live_connections.values()
-        assert isinstance(connection, _Connection)
+    with urllib.request.urlopen(asking) as answer:
+        packed = answer.read()
+    assert answer.headers.get_all("Content-Encoding") == ["gzip"]
+    assert gzip.decompress(packed).decode() == read(viewer)[2]

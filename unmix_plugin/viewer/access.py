@@ -13,7 +13,7 @@ from pathlib import Path
 from unmix_plugin.engine.training.training_control import SHARE_BOUNDS
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.limits import read_bounded
-from unmix_plugin.viewer.gate import ANYWHERE, is_address
+from unmix_plugin.viewer.authentication import ANYWHERE, is_address
 
 TOKEN_VARIABLE = "UNMIX_VIEWER_TOKEN"
 

@@ -1,38 +1,35 @@
-"""viser's server as the viewer needs it: our title, no public tunnel, a gate at the handshake, bounded messages.
+"""viser behind authentication and limits: every request is judged, every message bounded, before viser sees it.
 
-viser has no setting for these. All that this package uses of its private parts is here, as in viser 1.1; what comes
-from websockets is public.
+viser has no setting for that, but asks `websockets.asyncio.server.serve`, a public function, for its server. While it
+starts, that name stands for ours, which adds what websockets offers for the purpose: a judge of requests, headers of
+answers, a class of connections. Of viser nothing private is used. A version that came by its server in another way is
+stopped at once, and refused. Behind a proxy viser would have a port of its own, at which others on this machine could
+reach it past the token and the limits.
 """
 
 from __future__ import annotations
 
 import asyncio
-import atexit
+import gzip
 import io
 import logging
-import shutil
-import tempfile
+import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
-from functools import partial
+from functools import lru_cache, partial
 from html import escape
 from http import HTTPStatus
-from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, TypeAlias
 
 import msgspec
 import viser
 import websockets.asyncio.server
-import websockets.datastructures
-import websockets.exceptions
-from viser import infra
-from viser.infra import _infra
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
-from unmix_plugin.viewer.gate import Gate
+from unmix_plugin.errors import ConfigError
+from unmix_plugin.viewer.authentication import Authentication
 
 LABEL = "unmix-nerf"
 
@@ -136,9 +133,9 @@ def _is_heard(data: bytes) -> bool:
 class _Connection(ServerConnection):
     """A page's connection: what comes is bounded in size and pace before anything of it is kept."""
 
-    def __init__(self, gate: Gate, *arguments: Any, **options: Any) -> None:
+    def __init__(self, authentication: Authentication, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
-        self._gate = gate
+        self._authentication = authentication
         self._paid_until, self._has_spoken = 0.0, False
 
     async def recv(self, decode: bool | None = None) -> Any:
@@ -184,20 +181,7 @@ class _Connection(ServerConnection):
     def connection_lost(self, exc: Exception | None) -> None:
         """Give back the page's place."""
         super().connection_lost(exc)
-        self._gate.leave(self)
-
-
-class _PageServer(infra.WebsockServer):
-    """Sends viser's page under our title, dark where the browser's user prefers that."""
-
-    def __init__(self, title: str, *, http_server_root: Path, **options: Any) -> None:
-        folder = Path(tempfile.mkdtemp(prefix="unmix-viewer-"))
-        atexit.register(shutil.rmtree, folder, ignore_errors=True)
-        page = (http_server_root / "index.html").read_text(encoding="utf-8")
-        (folder / "index.html").write_text(
-            page.replace("<title>Viser</title>", _HEAD.replace("TITLE", escape(title)), 1), encoding="utf-8"
-        )
-        super().__init__(http_server_root=folder, **options)
+        self._authentication.leave(self)
 
 
 class _LocalServer(viser.ViserServer):
@@ -207,69 +191,105 @@ class _LocalServer(viser.ViserServer):
         return None
 
 
-_NAME = "websockets"
+_HEADERS = {"Content-Security-Policy": "frame-ancestors 'self'", "X-Frame-Options": "SAMEORIGIN"}
+"""Of every answer: no page of another site can show the viewer in a frame, and have its user click unseen."""
+
+_STARTING = threading.Lock()
+"""Held while `websockets.asyncio.server.serve` stands for ours."""
 
 
 def open_server(
-    host: str, port: int, gate: Gate, say: Callable[[str], None], title: str = LABEL
+    host: str, port: int, authentication: Authentication, say: Callable[[str], None], title: str = LABEL
 ) -> viser.ViserServer:
-    """A server that listens, and lets in what the gate does; `title` is that of its pages, and `say` is told of what
-    pages caused that should not have happened, in a short line each."""
-    before = infra.WebsockServer, getattr(_infra, _NAME)
-    infra.WebsockServer = partial(_PageServer, title)  # type: ignore[misc, assignment]
-    # viser asks websockets for its server in this module's name of it, once, while it starts.
-    gated = SimpleNamespace(
-        asyncio=SimpleNamespace(server=SimpleNamespace(serve=_serve_through(gate, say))),
-        datastructures=websockets.datastructures,
-        exceptions=websockets.exceptions,
-    )
-    setattr(_infra, _NAME, gated)
-    try:
-        with quiet():
-            return _LocalServer(host=host, port=port, label=LABEL, verbose=False)
-    finally:
-        infra.WebsockServer = before[0]
-        setattr(_infra, _NAME, before[1])
+    """A server that listens, and lets in what the authentication does; `title` is that of its pages, and `say` is told
+    of what pages caused that should not have happened, in a short line each. A ConfigError if viser is of a version
+    that can't be guarded."""
+    serve, ports = websockets.asyncio.server.serve, iter(range(port, 65536))
 
-
-def _serve_through(gate: Gate, say: Callable[[str], None]) -> Callable[..., websockets.asyncio.server.serve]:
-    """websockets' own `serve`, with the gate before what else answers requests, and our bounds."""
-    logger = logging.Logger(LABEL)  # of nobody: strangers' requests are not for the user's log
-    logger.addHandler(logging.NullHandler())
-
-    def serve(handler: Any, host: str, port: int, *, process_request: Any, **options: Any) -> Any:
-        async def judge(connection: ServerConnection, request: Request) -> Response | None:
-            return await _refusal(gate, connection, request) or process_request(connection, request)
-
+    def serve_guarded(handler: Any, *_address: Any, process_request: Any, **options: Any) -> Any:
         asyncio.get_running_loop().set_exception_handler(_fault_handler(say))
-        ours = {
-            "create_connection": partial(_Connection, gate),
+        guards = {
+            "process_request": partial(_answer, authentication, process_request, title),
+            "process_response": _add_headers,
+            "create_connection": partial(_Connection, authentication),
             "max_size": _LARGEST_MESSAGE,
             "max_queue": 4,
-            "logger": logger,
+            "logger": _silent_logger(),
         }
-        return websockets.asyncio.server.serve(
-            handler, host, port, process_request=judge, **{**options, **ours}
-        )
+        # Asked once more, viser found its port taken meanwhile.
+        return serve(handler, host, next(ports), **{**options, **guards})
 
-    return serve
+    with _STARTING, quiet():
+        websockets.asyncio.server.serve = serve_guarded  # type: ignore[misc, assignment]
+        try:
+            server = _LocalServer(host="127.0.0.1", port=0, label=LABEL, verbose=False)
+        finally:
+            websockets.asyncio.server.serve = serve  # type: ignore[misc]
+        if next(ports, 65536) == port:
+            server.stop()
+            raise ConfigError(
+                f"viser {viser.__version__} starts its server in a way that the viewer can't guard; install viser 1.1"
+            )
+    return server
 
 
-async def _refusal(gate: Gate, connection: ServerConnection, request: Request) -> Response | None:
+def _silent_logger() -> logging.Logger:
+    """A logger of nobody: requests of strangers are not for the user's log."""
+    logger = logging.Logger(LABEL)
+    logger.addHandler(logging.NullHandler())
+    return logger
+
+
+async def _answer(
+    authentication: Authentication,
+    read_file: Callable[[ServerConnection, Request], Response],
+    title: str,
+    connection: ServerConnection,
+    request: Request,
+) -> Response | None:
+    """The answer to a request: a refusal, or the page; None opens the connection that was asked for. `read_file` is
+    viser's own answer to requests for files."""
     headers = {name.lower(): value for name, value in request.headers.raw_items()}
     opens = headers.get("upgrade", "").lower() == "websocket"
-    words = [word.strip() for word in headers.get("sec-websocket-protocol", "").split(",")]
-    if opens and f"viser-v{viser.__version__}" not in words:
+    versions = [word.strip() for word in headers.get("sec-websocket-protocol", "").split(",")]
+    if opens and f"viser-v{viser.__version__}" not in versions:
         return connection.respond(HTTPStatus.BAD_REQUEST, "this page is of another version: load it again")
     remote, local = connection.remote_address or ("",), connection.local_address or ("", 0)
-    refusal = await gate.judge(connection, headers, remote[0], local[1])
-    if refusal is None:
+    refusal = await authentication.refusal(connection, headers, address=remote[0], port=local[1])
+    if refusal is not None:
+        return _with_headers(connection.respond(refusal.status, refusal.text), refusal.headers)
+    if opens:
         return None
-    response = connection.respond(refusal.status, refusal.text)
-    for name, value in refusal.headers.items():
+    if request.path.partition("?")[0] not in ("/", "/index.html"):
+        return read_file(connection, request)
+    request.headers.pop("Accept-Encoding", None)  # so that viser's page comes as it is
+    response = read_file(connection, request)
+    plain, packed = _page_under(title, bytes(response.body))
+    is_packed = "gzip" in headers.get("accept-encoding", "")
+    response.body = packed if is_packed else plain
+    encoding = {"Content-Encoding": "gzip"} if is_packed else {}
+    response.headers.pop("Content-Encoding", None)
+    return _with_headers(response, {**encoding, "Content-Length": str(len(response.body))})
+
+
+@lru_cache(maxsize=8)
+def _page_under(title: str, page: bytes) -> tuple[bytes, bytes]:
+    """viser's page with our head, as it is and compressed."""
+    head = _HEAD.replace("TITLE", escape(title)).encode()
+    plain = page.replace(b"<title>Viser</title>", head, 1)
+    return plain, gzip.compress(plain)
+
+
+def _with_headers(response: Response, headers: Mapping[str, str]) -> Response:
+    """The response with headers in place of those of the same names."""
+    for name, value in headers.items():
         response.headers.pop(name, None)
         response.headers[name] = value
     return response
+
+
+def _add_headers(_connection: ServerConnection, _request: Request, response: Response) -> Response:
+    return _with_headers(response, _HEADERS)
 
 
 def _fault_handler(say: Callable[[str], None]) -> Callable[[Any, dict[str, Any]], None]:
@@ -290,7 +310,7 @@ def _fault_handler(say: Callable[[str], None]) -> Callable[[Any, dict[str, Any]]
 def send_what_is_queued(server: viser.ViserServer) -> None:
     """Send pages what is queued for them, before a server is stopped."""
     server.flush()
-    asyncio.run_coroutine_threadsafe(asyncio.sleep(_SENDING_S), server._event_loop).result()
+    time.sleep(_SENDING_S)
 
 
 @contextmanager

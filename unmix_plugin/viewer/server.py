@@ -1,4 +1,4 @@
-"""The viewer's life cycle: listen, keep a session for each page that the gate lets in, shut down cleanly."""
+"""The viewer's life cycle: listen, keep a session for each page that is let in, shut down cleanly."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ import viser
 
 from unmix_plugin.trained.run_views import up_direction
 from unmix_plugin.viewer.access import ViewerOptions, free_port, start_notices
+from unmix_plugin.viewer.authentication import Authentication
 from unmix_plugin.viewer.connections import LABEL, open_server, quiet, send_what_is_queued
-from unmix_plugin.viewer.gate import Gate
 from unmix_plugin.viewer.page import failures_said, paragraph
 from unmix_plugin.viewer.panels import panels_of
 from unmix_plugin.viewer.session import PageState, Services, Session
@@ -76,7 +76,7 @@ class Viewer:
     ) -> None:
         """`say` prints a line on the user's terminal; a ConfigError if the token can't be read."""
         self._options, self._say = options, say
-        self._gate = Gate(options.host, options.secret(os.environ), say)
+        self._authentication = Authentication(options.host, options.secret(os.environ), say)
         self._kept_pages = _KeptPages()
         self.services = services
         self._sessions: dict[int, Session] = {}
@@ -94,7 +94,7 @@ class Viewer:
         port = free_port(self._options.host, self._options.port)
         scene = self.services.source.record
         name = Path(str(scene.summary.get("root") or LABEL)).name
-        server = open_server(self._options.host, port, self._gate, self._say, f"{name} - {LABEL}")
+        server = open_server(self._options.host, port, self._authentication, self._say, f"{name} - {LABEL}")
         self._server, self.port = server, server.get_port()
         server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
         server.gui.set_panel_label(name)

@@ -1,5 +1,7 @@
+import ast
 import math
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -263,3 +265,25 @@ def test_the_page_of_docs_lists_every_named_index_as_it_is_computed():
         low, high = named.usual_range
         assert f"| {named.title} | `{named.formula}` | {named.source} | {low:g} to {high:g} |" in page
         assert f"| `{name}` " in page
+
+
+def test_formulas_are_parsed_one_at_a_time_and_once(monkeypatch):
+    """`ast.parse` in two threads at once fails now and then: CPython issue 106905."""
+    parse, running, most = ast.parse, [], []
+
+    def slow_parse(*words, **options):
+        running.append(1)
+        most.append(len(running))
+        time.sleep(0.02)
+        running.pop()
+        return parse(*words, **options)
+
+    monkeypatch.setattr(ast, "parse", slow_parse)
+    formulas = [f"(r800-r67{number})/(r800+r67{number})" for number in range(4)]
+    with ThreadPoolExecutor(4) as threads:
+        read = list(threads.map(parse_formula, 2 * formulas))
+    assert [one.text for one in read] == 2 * formulas
+    assert max(most) == 1
+    count = len(most)
+    assert parse_formula(formulas[0]).wavelengths_nm == (670.0, 800.0)
+    assert len(most) == count

@@ -16,9 +16,10 @@ import ast
 import csv
 import difflib
 import re
+import threading
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from functools import reduce
+from functools import lru_cache, reduce
 from importlib import resources
 
 import torch
@@ -111,8 +112,13 @@ class _Formula:
         return value(self.tree)
 
 
+_PARSER = threading.Lock()
+"""Held while Python parses: in threads at once `ast.parse` fails now and then up to 3.11 (CPython issue 106905)."""
+
+
+@lru_cache(maxsize=256)
 def parse_formula(text: str) -> _Formula:
-    """Read a formula.
+    """Read a formula; one that was read lately is not parsed again.
 
     Raises:
         ConfigError: no formula, too long, nested too deep, or without a wavelength; the message shows the place.
@@ -140,7 +146,9 @@ def parse_formula(text: str) -> _Formula:
             raise _fault(text, match.start())
         expression = expression[: match.start()] + read + expression[match.end() :]
     try:
-        formula = _Formula(text, wavelengths, ast.parse(expression, mode="eval").body)
+        with _PARSER:
+            tree = ast.parse(expression, mode="eval").body
+        formula = _Formula(text, wavelengths, tree)
         formula.evaluate(lambda _: torch.zeros(()), torch.zeros(()))  # which refuses what is not allowed
     except SyntaxError as error:
         raise _fault(text, (error.offset or 1) - 1) from error

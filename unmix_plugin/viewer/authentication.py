@@ -28,10 +28,10 @@ MOST_PAGES = 16
 """Pages that are served at once."""
 
 _GUESS_S = 0.5
-"""Time that a guess of the token takes its address, so that nobody gets through a dictionary."""
+"""Time between two guesses of the token, of all addresses together, so that nobody gets through a dictionary."""
 
-_MOST_WAITING = 16
-"""Guesses from one address that may wait for their turn at once."""
+_MOST_WAITING, _MOST_WAITING_IN_ALL = 16, 64
+"""Guesses that may wait for their turn at once: from one address, and from all of them."""
 
 _ROOM_S = 2.0
 """How long a page waits for a place: one that is loaded again comes before its old connection has gone."""
@@ -48,7 +48,45 @@ class _Refusal:
     headers: Mapping[str, str] = field(default_factory=lambda: {"Content-Type": "text/plain; charset=utf-8"})
 
 
-class Gate:
+class _GuessQueue:
+    """Guesses of the token, one every `_GUESS_S`: each address that guesses has its turn before one of them has
+    another, so that a crowd of guesses from one address does not keep the owner out."""
+
+    def __init__(self) -> None:
+        self._waiting: list[tuple[int, str, object]] = []
+        """In which round each guess has its turn, and the network that it comes from."""
+        self._round, self._next_at = 0, 0.0
+
+    async def turn(self, address: str) -> bool:
+        """Wait for the turn of a guess; False if too many wait already."""
+        network = _network_of(address)
+        rounds = [number for number, other, _ in self._waiting if other == network]
+        if len(rounds) >= _MOST_WAITING or len(self._waiting) >= _MOST_WAITING_IN_ALL:
+            return False
+        mine = (max([self._round, *rounds]) + 1, network, object())
+        self._waiting.append(mine)
+        if self._waiting == [mine]:
+            self._next_at = max(self._next_at, time.monotonic() + _GUESS_S)
+        try:
+            # The first of the least round; Python's min takes the first of equals.
+            while min(self._waiting, key=lambda one: one[0]) is not mine or time.monotonic() < self._next_at:
+                await asyncio.sleep(_GUESS_S / 10)
+        finally:
+            self._waiting.remove(mine)
+        self._round, self._next_at = mine[0], time.monotonic() + _GUESS_S
+        return True
+
+
+def _network_of(address: str) -> str:
+    """What one guesser has of addresses: one of IPv4, but 2^64 of IPv6."""
+    try:
+        found = ipaddress.ip_address(address.partition("%")[0])
+    except ValueError:
+        return address
+    return str(found if found.version == 4 else ipaddress.ip_network((found, 64), strict=False))
+
+
+class Authentication:
     """Judges requests and counts pages; used by the server's event loop alone."""
 
     def __init__(self, host: str, token: str | None, say: Callable[[str], None] = lambda _: None) -> None:
@@ -58,9 +96,9 @@ class Gate:
         self._cookie_value = secrets.token_urlsafe(32)
         self._pages: set[Hashable] = set()
         self._sites_warned_of: set[str] = set()
-        self._turns: dict[str, float] = {}
+        self._guesses = _GuessQueue()
 
-    async def judge(
+    async def refusal(
         self, page: Hashable, headers: Mapping[str, str], address: str, port: int
     ) -> _Refusal | None:
         """What to answer to a request instead of what it asks for; None if it is let in.
@@ -104,16 +142,11 @@ class Gate:
         )
 
     async def _check(self, given: str, address: str) -> _Refusal | None:
-        """Check the token, in turn for each address; why it is turned down, None if it is right."""
-        now = time.monotonic()
-        self._turns = {known: turn for known, turn in self._turns.items() if turn > now}
-        turn = self._turns[address] = max(self._turns.get(address, now), now) + _GUESS_S
-        if turn - now > _MOST_WAITING * _GUESS_S:
-            self._turns[address] = turn - _GUESS_S
+        """Check the token when it is its turn; why it is turned down, None if it is right."""
+        if not await self._guesses.turn(address):
             return _Refusal(
                 HTTPStatus.TOO_MANY_REQUESTS, "Too many guesses are waiting: try again in some seconds."
             )
-        await asyncio.sleep(turn - now)
         assert self._token is not None
         is_right = hmac.compare_digest(_given_word(given), self._token)
         return None if is_right else _Refusal(HTTPStatus.UNAUTHORIZED, "That is not the token.")

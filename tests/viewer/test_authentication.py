@@ -3,6 +3,7 @@
 import asyncio
 import base64
 import socket
+import time
 from http import HTTPStatus
 from typing import Any
 
@@ -10,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from unmix_plugin.viewer import gate as gates
-from unmix_plugin.viewer.gate import MOST_PAGES, Gate, _is_own_page
+from unmix_plugin.viewer import authentication as module
+from unmix_plugin.viewer.authentication import MOST_PAGES, Authentication, _is_own_page
 
 HERE = {"host": "127.0.0.1:7007"}
 OPENING = {**HERE, "upgrade": "websocket"}
@@ -21,15 +22,15 @@ def with_word(word, headers=HERE):
     return {**headers, "authorization": "Basic " + base64.b64encode(f":{word}".encode()).decode()}
 
 
-def asked(gate, headers=HERE, page=0, port=7007) -> Any:
-    return asyncio.run(gate.judge(page, headers, "10.0.0.1", port))
+def asked(authentication, headers=HERE, page=0, port=7007) -> Any:
+    return asyncio.run(authentication.refusal(page, headers, "10.0.0.1", port))
 
 
 @pytest.fixture
 def ask(monkeypatch):
-    """Asks a gate, which then answers in no time."""
-    monkeypatch.setattr(gates, "_GUESS_S", 0.001)
-    monkeypatch.setattr(gates, "_ROOM_S", 0.0)
+    """Asks an authentication, which then answers in no time."""
+    monkeypatch.setattr(module, "_GUESS_S", 0.001)
+    monkeypatch.setattr(module, "_ROOM_S", 0.0)
     return asked
 
 
@@ -37,35 +38,38 @@ def ask(monkeypatch):
 @settings(max_examples=30)
 def test_only_the_token_itself_is_admitted(word):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(gates, "_GUESS_S", 0.001)
-        gate = Gate("127.0.0.1", "sésame")
-        assert asked(gate, with_word(word)).status == HTTPStatus.UNAUTHORIZED
-        assert asked(gate, with_word("sésame", OPENING)) is None
+        patch.setattr(module, "_GUESS_S", 0.001)
+        authentication = Authentication("127.0.0.1", "sésame")
+        assert asked(authentication, with_word(word)).status == HTTPStatus.UNAUTHORIZED
+        assert asked(authentication, with_word("sésame", OPENING)) is None
 
 
 def test_the_token_is_asked_for_once_and_a_cookie_stands_for_it(ask):
-    gate = Gate("127.0.0.1", "sesame")
-    asking = ask(gate)
+    authentication = Authentication("127.0.0.1", "sesame")
+    asking = ask(authentication)
     assert (asking.status, "asks for the token" in asking.text) == (HTTPStatus.UNAUTHORIZED, True)
-    assert ask(gate, OPENING).status == HTTPStatus.UNAUTHORIZED
-    cookie = ask(gate, with_word("sesame")).headers["Set-Cookie"]
+    assert ask(authentication, OPENING).status == HTTPStatus.UNAUTHORIZED
+    cookie = ask(authentication, with_word("sesame")).headers["Set-Cookie"]
     assert "HttpOnly" in cookie
     assert "SameSite=Strict" in cookie
     assert "sesame" not in cookie
     given = {"cookie": cookie.partition(";")[0]}
-    assert ask(gate, {**HERE, **given}) is None
-    assert ask(gate, {**OPENING, **given}) is None
-    assert ask(gate, {**OPENING, **given}, port=7008).status == HTTPStatus.UNAUTHORIZED
-    assert ask(Gate("127.0.0.1", "sesame"), {**HERE, **given}).status == HTTPStatus.UNAUTHORIZED
-    assert ask(gate, {**OPENING, **given, "origin": "http://127.0.0.1:8000"}).status == HTTPStatus.FORBIDDEN
+    assert ask(authentication, {**HERE, **given}) is None
+    assert ask(authentication, {**OPENING, **given}) is None
+    assert ask(authentication, {**OPENING, **given}, port=7008).status == HTTPStatus.UNAUTHORIZED
+    assert ask(Authentication("127.0.0.1", "sesame"), {**HERE, **given}).status == HTTPStatus.UNAUTHORIZED
+    assert (
+        ask(authentication, {**OPENING, **given, "origin": "http://127.0.0.1:8000"}).status
+        == HTTPStatus.FORBIDDEN
+    )
 
 
 def test_each_address_has_one_guess_checked_at_a_time_and_a_limited_number_waiting(monkeypatch):
-    monkeypatch.setattr(gates, "_GUESS_S", 0.02)
-    gate, ended = Gate("127.0.0.1", "sesame"), []
+    monkeypatch.setattr(module, "_GUESS_S", 0.02)
+    authentication, ended = Authentication("127.0.0.1", "sesame"), []
 
     async def guess(number, word, address):
-        refusal: Any = await gate.judge(number, with_word(word), address, 7007)
+        refusal: Any = await authentication.refusal(number, with_word(word), address, 7007)
         ended.append((number, refusal.status))
 
     async def crowd():
@@ -74,38 +78,79 @@ def test_each_address_has_one_guess_checked_at_a_time_and_a_limited_number_waiti
 
     asyncio.run(crowd())
     refused = [number for number, status in ended if status == HTTPStatus.TOO_MANY_REQUESTS]
-    assert len(refused) == 30 - gates._MOST_WAITING
+    assert len(refused) == 30 - module._MOST_WAITING
     assert ended.index((100, HTTPStatus.OK)) <= len(refused) + 1
     waited = [number for number, _ in ended if number not in (*refused, 100)]
     assert waited == sorted(waited)
 
 
+def test_guesses_from_many_addresses_are_slowed_together(monkeypatch):
+    """A network of many addresses gets no further through a dictionary than one."""
+    monkeypatch.setattr(module, "_GUESS_S", 0.02)
+    authentication, ended = Authentication("127.0.0.1", "sesame"), []
+
+    async def guess(address):
+        refusal: Any = await authentication.refusal(address, with_word("barley"), address, 7007)
+        ended.append((time.monotonic(), refusal.status))
+
+    async def crowd():
+        await asyncio.gather(*(guess(f"10.0.0.{number}") for number in range(30)))
+
+    begun = time.monotonic()
+    asyncio.run(crowd())
+    assert {status for _, status in ended} == {HTTPStatus.UNAUTHORIZED}
+    assert max(at for at, _ in ended) - begun >= 30 * 0.02
+    ended.clear()
+
+    async def larger_crowd():
+        await asyncio.gather(*(guess(f"10.0.{number}.1") for number in range(100)))
+
+    asyncio.run(larger_crowd())
+    refused = [status for _, status in ended if status == HTTPStatus.TOO_MANY_REQUESTS]
+    assert len(refused) == 100 - module._MOST_WAITING_IN_ALL
+
+
+def test_all_addresses_of_one_network_of_ipv6_are_one_guesser(monkeypatch):
+    monkeypatch.setattr(module, "_GUESS_S", 0.002)
+    authentication, refused = Authentication("127.0.0.1", "sesame"), []
+
+    async def guess(address):
+        refusal: Any = await authentication.refusal(address, with_word("barley"), address, 7007)
+        refused.append(refusal.status == HTTPStatus.TOO_MANY_REQUESTS)
+
+    async def crowd():
+        await asyncio.gather(*(guess(f"2001:db8::{number}") for number in range(30)))
+
+    asyncio.run(crowd())
+    assert sum(refused) == 30 - module._MOST_WAITING
+
+
 def test_places_are_limited_and_given_back(ask):
-    gate = Gate("127.0.0.1", None)
-    assert all(ask(gate, OPENING, page) is None for page in range(MOST_PAGES))
+    authentication = Authentication("127.0.0.1", None)
+    assert all(ask(authentication, OPENING, page) is None for page in range(MOST_PAGES))
     for headers in (OPENING, HERE):
-        refusal = ask(gate, headers, 100)
+        refusal = ask(authentication, headers, 100)
         assert refusal.status == HTTPStatus.SERVICE_UNAVAILABLE
         assert "16 pages are open already" in refusal.text
-    gate.leave(3)
-    gate.leave(3)
-    assert ask(gate) is None  # what is only read takes no place
-    assert ask(gate, OPENING, 100) is None
-    assert ask(gate, OPENING, 101) is not None
+    authentication.leave(3)
+    authentication.leave(3)
+    assert ask(authentication) is None  # what is only read takes no place
+    assert ask(authentication, OPENING, 100) is None
+    assert ask(authentication, OPENING, 101) is not None
 
 
 def test_foreign_pages_take_no_place_and_their_site_is_said_once(ask):
     said = []
-    gate = Gate("127.0.0.1", None, said.append)
+    authentication = Authentication("127.0.0.1", None, said.append)
     for page in range(64):
-        refusal = ask(gate, {**OPENING, "origin": "http://evil.example\x1b[2J"}, page)
+        refusal = ask(authentication, {**OPENING, "origin": "http://evil.example\x1b[2J"}, page)
         assert refusal.status == HTTPStatus.FORBIDDEN
     assert len(said) == 1
     assert "another site (http://evil.example[2J)" in said[0]
     for number in range(100):
-        ask(gate, {**OPENING, "origin": f"http://{number}.example"})
-    assert len(said) == gates._MOST_SITES_NAMED
-    assert ask(gate, OPENING) is None
+        ask(authentication, {**OPENING, "origin": f"http://{number}.example"})
+    assert len(said) == module._MOST_SITES_NAMED
+    assert ask(authentication, OPENING) is None
 
 
 MINE = socket.gethostname()
@@ -155,10 +200,10 @@ def test_with_the_token_a_page_may_come_through_a_proxy(origin, host, listens_at
 
 
 def test_a_malformed_cookie_of_another_program_does_not_hide_ours_and_malformed_words_are_wrong_ones(ask):
-    gate = Gate("127.0.0.1", "sesame")
-    ours = ask(gate, with_word("sesame")).headers["Set-Cookie"].partition(";")[0]
+    authentication = Authentication("127.0.0.1", "sesame")
+    ours = ask(authentication, with_word("sesame")).headers["Set-Cookie"].partition(";")[0]
     for other in ('a={"x":1}', "flag", "a=b c", "é=1"):
-        assert ask(gate, {**HERE, "cookie": f"{other}; {ours}"}) is None
-    assert ask(gate, {**HERE, "cookie": f"{ours}x"}).status == HTTPStatus.UNAUTHORIZED
+        assert ask(authentication, {**HERE, "cookie": f"{other}; {ours}"}) is None
+    assert ask(authentication, {**HERE, "cookie": f"{ours}x"}).status == HTTPStatus.UNAUTHORIZED
     for words in ("", "Basic", "Basic ?", "Basic c2VzYW1l", "Bearer OnNlc2FtZQ==", "\xff"):
-        assert ask(gate, {**HERE, "authorization": words}).status == HTTPStatus.UNAUTHORIZED
+        assert ask(authentication, {**HERE, "authorization": words}).status == HTTPStatus.UNAUTHORIZED
