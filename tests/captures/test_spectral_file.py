@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.captures.file_factory import file_of, present
-from unmix_plugin.captures.calibration.calibration import exposure_of
+from unmix_plugin.captures.calibration.exposures import exposure_of
 from unmix_plugin.captures.readers.band_files import stack_bands
 from unmix_plugin.captures.spectral_file import BandTable, SpectralFile, linear_values
 from unmix_plugin.errors import CaptureError

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from unmix_plugin import __version__
-from unmix_plugin.captures.calibration.calibration import compare_exposures, exposure_of
+from unmix_plugin.captures.calibration.exposures import ExposedFiles, compare_exposures, exposure_of
 from unmix_plugin.captures.calibration.references import is_srgb
 from unmix_plugin.captures.calibration.sensor import (
     BRIGHT_PERCENTILE,
@@ -155,7 +155,8 @@ def make_plan(
             "background": None if rule is None else rule.evidence,
         }
     decisions = {"scale": {"calibrated": scale, "evidence": why}, "mask": mask, "sensors": evidence}
-    said = [*(note for sensor in sensors.values() for note in sensor.notes), *said_of_mask]
+    remarks = [remark for sensor in sensors.values() for remark in sensor.remarks]
+    said = [*sentences(remarks, Kind.DONE), *said_of_mask]
     if found := [backdrop for backdrop in backdrops.values() if backdrop is not None]:
         said.append(
             f"a backdrop was found that all views share, {', '.join(each.in_words for each in found)}, and is cut out: "
@@ -166,8 +167,11 @@ def make_plan(
     opened = [file for file in references if file is not None]
     texts = (options.wavelengths or "", options.white_reflectance)  # numbers, or the name of a table
     tables = filter(os.path.isfile, texts)
-    warned = [warning for sensor in sensors.values() for warning in sensor.warnings]
+    warned = sentences(remarks, Kind.WRONG)
     warned += _doubts_of_values([*sensors.values()], 1.0 if options.scale is not None else scale)
+    kinds = {(one.is_absolute, one.is_stated): one.unit for one in sensors.values()}
+    if len(kinds) > 1 and not any(is_srgb(view.cube) for view in views):
+        warned += sentences([Remark.of(Code.UNLIKE_MEANINGS, kinds=[*kinds.values()])], Kind.WRONG)
     end = min(sensor.saturated_from for sensor in sensors.values())
     if end < _LEAST_END * scale:
         warned.append(
@@ -209,21 +213,19 @@ def _with_one_exposure(sensors: dict[str, Sensor], first: dict[str, SpectralFile
     ]
     if len(bare) < 2 or not files:
         return sensors
-    notes: list[str] = []
-    warnings: list[str] = []
-    bent, finished = any(map(is_srgb, files)), any(map(may_be_reflectance, files))
-    common = compare_exposures(files, [], [], bent, finished, notes, warnings)
+    is_bent, is_finished = any(map(is_srgb, files)), any(map(may_be_reflectance, files))
+    compared = compare_exposures(ExposedFiles(files, is_srgb=is_bent, may_be_reflectance=is_finished))
+    common = compared.common
+    remarks = [one for one in compared.remarks if one.code.looks_wrong or known or common is None]
     if known and rest:
-        unlike = f"exposures of {name_some(rest)} are not known or not compared, those of {name_some([*known])} are"
-        warnings.append(f"{unlike}: values of these lenses or cameras may be off by a factor")
+        remarks.append(Remark.of(Code.EXPOSURE_OF_SOME_SENSORS, lacking=rest, known=[*known]))
     brought, first_name = dict(sensors), next(iter(bare))
     for name, exposure in known.items() if common is not None else ():
         sensor, factor = sensors[name], (common / exposure).astype(np.float32)
         calibration = replace(sensor.calibration, exposure=common)
         brought[name] = replace(sensor, calibration=calibration, sample=sensor.sample * factor)
     one = brought[first_name]
-    noted = (*one.notes, *(notes if known or common is None else ()))
-    brought[first_name] = replace(one, notes=noted, warnings=(*one.warnings, *warnings))
+    brought[first_name] = replace(one, remarks=(*one.remarks, *remarks))
     return brought
 
 

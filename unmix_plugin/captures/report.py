@@ -28,19 +28,83 @@ class Kind(Enum):
     DONE = "What was done"
 
 
-_WRONG, _MEASURED, _DONE = Kind
+def _wrong(template: str) -> tuple[Kind, str]:
+    return Kind.WRONG, template
+
+
+def _done(template: str) -> tuple[Kind, str]:
+    return Kind.DONE, template
 
 
 @unique
 class Code(Enum):
     """All that may be remarked, with its kind and the template of its sentence."""
 
-    FILE_NOTE = _DONE, "{text}"
+    FILE_NOTE = _done("{text}")
     """Of a reader, which has no code of its own for it."""
-    FILE_WARNING = _WRONG, "{where}: {text}"
+    FILE_WARNING = _wrong("{where}: {text}")
     """Of a reader, which has no code of its own for it."""
-    CAPTURE_WARNING = _WRONG, "{text}"
+    CAPTURE_WARNING = _wrong("{text}")
     """Of a layout or a source of poses, which has no code of its own for it."""
+
+    # Exposures.
+    EXPOSURE_COUNTED_BEFORE = _done(
+        "views were exposed {exposed} {unit}: values are not divided by that, as {source} says that they are "
+        "reflectance or radiance already"
+    )
+    EXPOSURES_EVENED = _done(
+        "views were exposed {exposed} {unit}: each is brought to that of {whose}, {common}"
+    )
+    EXPOSURE_UNKNOWN = _wrong("{missing:view} without exposure time: exposures are not compared")
+    EXPOSURE_FACTOR_UNKNOWN = _wrong(
+        "the {factor} is known of some files and not of {lacking}: exposures are not compared; write it into all, "
+        "or none"
+    )
+    GAIN_TAKEN_AS_ONE = _wrong(
+        "the gain is 1 in some files and not known of {lacking}, where it is taken for 1, too: values may be off "
+        "by a factor"
+    )
+    WHITE_EXPOSURE_UNKNOWN = _wrong(
+        "views were exposed {exposed} {unit}, the white reference does not say how long: reflectances may be off "
+        "by a factor"
+    )
+    DARK_EXPOSED_OTHERWISE = _wrong(
+        "the dark frame was exposed {of_dark} s times gain, what it is subtracted from {of_others}: dark current "
+        "grows with exposure, so take a dark frame at each"
+    )
+    EXPOSURES_OF_PICTURES = _wrong(
+        "pictures were exposed {exposed} {unit}, which can't be undone as cameras bend the brightness of pictures:"
+        " fix the exposure"
+    )
+    EXPOSURES_OF_REFLECTANCES = _wrong(
+        "views were exposed {exposed} {unit}: values are not divided by that, as they are at most about 1 and "
+        "taken for reflectances. If they grow with the exposure, as raw numbers do, give a white reference, or "
+        "divide them by it yourself"
+    )
+    EXPOSURES_MISFIT = _wrong(
+        "{where}: {numbers} exposure times or gains for {bands:band}: exposures may differ and were not compared. "
+        "Give one number, or one a band, with points as decimal marks"
+    )
+    EXPOSURE_UNITS_MISSING = _wrong(
+        "{factor} have no unit in some files ({evidence}): values may be off by a factor"
+    )
+    EXPOSURE_OF_SOME_SENSORS = _wrong(
+        "exposures of {lacking} are not known or not compared, those of {known} are: values of these lenses or "
+        "cameras may be off by a factor"
+    )
+    UNLIKE_MEANINGS = _wrong(
+        "values of lenses or cameras are not of one kind ({kinds:5}): they may be off by a factor against each "
+        "other"
+    )
+
+    # Bands.
+    WHITE_SATURATED = _wrong(
+        "{file}: the white is saturated in {bands}: these bands are left out; take it again with a shorter "
+        "exposure"
+    )
+    NOISY_BANDS_KEPT = _done(
+        "{noisy} of {bands} bands have noise above {limit} of their signal; all are kept"
+    )
 
     def __init__(self, kind: Kind, template: str) -> None:
         self.kind = kind

@@ -1,8 +1,8 @@
 """Exposure under its many names, and what becomes of it."""
 
-from dataclasses import replace
+import json
+from dataclasses import dataclass, replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,8 +17,9 @@ from tests.captures.capture_factory import (
     write_poses,
 )
 from tests.captures.file_factory import file_of, present
-from unmix_plugin.captures.calibration.calibration import compare_exposures, exposure_of
+from unmix_plugin.captures.calibration.exposures import ExposedFiles, compare_exposures, exposure_of
 from unmix_plugin.captures.header_values import exposure_facts
+from unmix_plugin.captures.report import Code, Kind, Remark, sentences
 from unmix_plugin.captures.spectral_file import Linear
 
 pytestmark = pytest.mark.usefixtures("no_contact_sheet")
@@ -97,11 +98,29 @@ def exposed(time, gain=1.0, evidence="header field 'tint', no unit: taken as mil
     return file_of(np.ones((2, 2, 3), np.uint16), metadata=facts)
 
 
-def compared(views, whites=(), darks=(), is_bent=False, may_be_finished=False):
+@dataclass(frozen=True)
+class Compared:
     """What they are brought to, with notes and warnings."""
-    notes, warnings = [], []
-    common = compare_exposures(views, whites, darks, is_bent, may_be_finished, notes, warnings)
-    return SimpleNamespace(common=common, notes=notes, warnings=warnings)
+
+    common: np.ndarray | None
+    remarks: tuple[Remark, ...]
+
+    @property
+    def codes(self) -> set[Code]:
+        return {remark.code for remark in self.remarks}
+
+    @property
+    def notes(self) -> list[str]:
+        return sentences(self.remarks, Kind.DONE)
+
+    @property
+    def warnings(self) -> list[str]:
+        return sentences(self.remarks, Kind.WRONG)
+
+
+def compared(views, whites=(), darks=(), is_bent=False, may_be_finished=False) -> Compared:
+    found = compare_exposures(ExposedFiles(views, whites, darks, is_bent, may_be_finished))
+    return Compared(found.common, found.remarks)
 
 
 def test_views_are_brought_to_the_white_and_that_is_said():
@@ -228,3 +247,57 @@ def test_values_are_finished_by_gains_or_names_that_say_so():
         assert "not divided by that" in notes(linear=replace(linear, evidence=evidence))[0]
     assert "each is brought to" in notes(linear=linear)[0]
     assert "each is brought to" in notes(path=Path("reflectances_of_lamps.npy"), dtype=values)[0]
+
+
+def stating(**facts):
+    return file_of(np.ones((2, 2, 3), np.uint16), metadata={"exposure_s": 0.01, **facts})
+
+
+@pytest.mark.parametrize(
+    ("views", "whites", "code", "is_compared"),
+    [
+        ([{"gain": 4.0}], [{}], Code.EXPOSURE_FACTOR_UNKNOWN, False),
+        ([{}], [{"gain": 4.0}], Code.EXPOSURE_FACTOR_UNKNOWN, False),
+        ([{"gain": 4.0}, {}], [], Code.EXPOSURE_FACTOR_UNKNOWN, False),
+        ([{"gain": [1.0, 2.0, 1.0]}, {}], [], Code.EXPOSURE_FACTOR_UNKNOWN, False),
+        ([{"f_number": 4.0}], [{}], Code.EXPOSURE_FACTOR_UNKNOWN, False),
+        ([{"gain": 1.0}], [{}], Code.GAIN_TAKEN_AS_ONE, True),
+        ([{}], [{"exposure_s": None}], Code.WHITE_EXPOSURE_UNKNOWN, True),
+        ([{"exposure_s": None}], [{}], Code.EXPOSURE_UNKNOWN, False),
+        ([{"exposure_s": None}, {}], [], Code.EXPOSURE_UNKNOWN, False),
+    ],
+)
+def test_what_one_file_states_and_another_lacks_is_not_taken_for_one_in_silence(
+    views, whites, code, is_compared
+):
+    found = compared([stating(**facts) for facts in views], [stating(**facts) for facts in whites])
+    assert found.codes == {code}
+    assert code.looks_wrong
+    assert (found.common is not None) == is_compared
+
+
+def test_values_are_not_divided_by_a_gain_that_the_white_lacks(tmp_path):
+    made = make_capture(tmp_path / "capture")
+    for name in ("view_00", "view_01", "view_02", "view_03", "white", "dark"):
+        with (tmp_path / "capture" / f"{name}.hdr").open("a") as header:
+            header.write("exposure time (us) = 10000\n" + ("" if name == "white" else "gain = 4\n"))
+    references = {key: tmp_path / "capture" / f"{key}.hdr" for key in ("white", "dark")}
+    wrong = process(tmp_path / "capture", tmp_path / "scene", **references)
+    assert any("the gain is known of some files and not of white.hdr" in text for text in wrong)
+    for view in made.reflectance:
+        stored = np.load(tmp_path / "scene" / "cubes" / f"{view}.npy") / 65535
+        np.testing.assert_allclose(stored, made.reflectance[view], atol=1e-3)
+
+
+def test_a_scale_that_files_of_another_size_lack_is_not_taken_for_one_in_silence(tmp_path):
+    made = make_capture(tmp_path / "capture", views=6)
+    for index, (name, values) in enumerate(made.reflectance.items()):
+        header = {"reflectance scale factor": "10000"} if index < 4 else {}
+        values = np.rint(values * 10000).astype(np.uint16)
+        write_cube(tmp_path / "capture", name, values[: HEIGHT - 8 * (index >= 4)], header=header)
+    written = json.loads((tmp_path / "capture" / "transforms.json").read_text())
+    for frame in written["frames"][4:]:
+        frame["h"] = HEIGHT - 8
+    (tmp_path / "capture" / "transforms.json").write_text(json.dumps(written))
+    wrong = process(tmp_path / "capture", tmp_path / "scene")
+    assert any("values of lenses or cameras are not of one kind" in text for text in wrong)

@@ -22,6 +22,7 @@ from unmix_plugin.captures.calibration.sensor import (
 )
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.plan import _with_one_exposure as with_one_exposure
+from unmix_plugin.captures.report import Code
 from unmix_plugin.captures.spectral_file import CaptureView, Linear
 
 WAVELENGTHS_NM = np.linspace(400.0, 900.0, 12)
@@ -68,7 +69,7 @@ def test_what_is_wrong_with_every_band_drops_none():
     assert notes == []
     independent = GENERATOR.random((3000, 12)).astype(np.float32)
     assert _drop_found(choice, (independent, np.zeros_like(saturated)), 0.3, notes).dropped == {}
-    assert notes == ["12 of 12 bands have noise above 30% of their signal; all are kept"]
+    assert [(note.code, note.values["noisy"]) for note in notes] == [(Code.NOISY_BANDS_KEPT, 12)]
 
 
 def test_bands_are_sorted_and_binned_by_wavelength_and_used_once():
@@ -123,6 +124,15 @@ def test_counts_end_where_the_detector_does_in_wider_numbers_too(dtype, factor: 
     counts = GENERATOR.normal(2000, 900, (64, 64, 6)).clip(0, 4095).round()
     found = _find_saturation([file_of((counts * factor).astype(dtype))], np.arange(6))[0]
     assert found == expected
+
+
+def test_a_rim_without_a_measurement_hides_no_saturation():
+    counts = GENERATOR.normal(2000, 900, (64, 64, 6)).clip(0, 4095).round().astype(np.float32)
+    counts[:, :5], counts[:, -5:], counts[:2], counts[-2:] = (np.nan,) * 4
+    assert _find_saturation([file_of(counts)], np.arange(6))[0] == 4095.0
+    found, why = _find_saturation([file_of(np.full_like(counts, np.nan))], np.arange(6))
+    assert found is None
+    assert "no sampled pixel has a measurement" in why
 
 
 def white_of(counts: np.ndarray, **facts):
@@ -188,7 +198,7 @@ def test_sensors_of_one_camera_have_one_exposure_or_it_is_said_why_not(dtype, sc
     cubes = {name: (scale * ratio * light).astype(dtype) for name, ratio in (("10x12", 1), ("12x10", 2))}
     times = {"10x12": facts | {"exposure_s": 0.01}, "12x10": facts | {"exposure_s": 0.02}}
     upright, across = together(cubes, times)
-    assert said in " ".join([*upright.notes, *upright.warnings])
+    assert said in " ".join(remark.sentence for remark in upright.remarks)
     assert np.allclose(across.sample, upright.sample, rtol=1e-2) == (dtype == np.uint16)
 
 
@@ -197,5 +207,6 @@ def test_what_is_wrong_with_exposures_of_one_sensor_is_said_once():
     cube = np.full((12, 10, 3), 1000, np.uint16) + np.arange(10, dtype=np.uint16)[:, None]
     times = {"a": {"exposure_s": [0.01, 0.02]}, "b": {"exposure_s": [0.01, 0.04]}}
     for sensor in together({"a": cube, "b": cube}, times):
-        (warning,) = sensor.warnings
-        assert "2 exposure times or gains for 3 bands" in warning
+        (remark,) = sensor.remarks
+        assert remark.code is Code.EXPOSURES_MISFIT
+        assert "2 exposure times or gains for 3 bands" in remark.sentence

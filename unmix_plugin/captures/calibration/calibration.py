@@ -10,24 +10,24 @@ bands of the result. Of exposures, `b` is 1, or the bands of a file.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 
+from unmix_plugin.captures.calibration.exposures import exposure_of
 from unmix_plugin.captures.calibration.references import (
     Reference,
     References,
     find_missing,
-    finished_by,
     refuse_outside,
     stated_values,
 )
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.spectral_file import SpectralFile
-from unmix_plugin.errors import ConfigError, counted, name_some
+from unmix_plugin.errors import ConfigError
 
 
 @dataclass(frozen=True)
@@ -200,150 +200,3 @@ class Calibration:
     def _in_bins(self, values: np.ndarray) -> np.ndarray:
         """Kept bands by bins, (n, w, b) to (n, w, c, bands of a bin)."""
         return values.reshape(*values.shape[:-1], self.num_bands, self.bin_bands)
-
-
-# How long views and their references were exposed, and what becomes of it.
-
-
-def exposure_of(file: SpectralFile, to_light: bool = True) -> Float64[np.ndarray, " b"] | None:
-    """Exposure time times gain, and over the square of the f-number if that is known, one number or one a band; None
-    where the file does not say the time.
-
-    Args:
-        to_light: Whether the aperture counts, which lets in light but no dark current.
-    """
-    time, gain = file.metadata.get("exposure_s"), file.metadata.get("gain", 1.0)
-    f_number = file.metadata.get("f_number", 1.0) if to_light else 1.0
-    try:
-        exposure = np.asarray(time, dtype=np.float64) * np.asarray(gain, dtype=np.float64)
-        exposure = np.atleast_1d(exposure / f_number**2)
-    except (TypeError, ValueError):
-        return None
-    is_usable = len(exposure) in (1, file.shape[2]) and np.isfinite(exposure).all() and (exposure > 0).all()
-    return exposure if is_usable else None
-
-
-def compare_exposures(
-    views: Sequence[SpectralFile],
-    whites: Sequence[SpectralFile],
-    darks: Sequence[tuple[SpectralFile, SpectralFile]],
-    is_bent: bool,
-    may_be_finished: bool,
-    notes: list[str],
-    warnings: list[str],
-) -> Float64[np.ndarray, " b"] | None:
-    """What all views are brought to (see `exposure_of`): the exposure of the white reference, otherwise of the first
-    view; None where exposures are not compared.
-
-    Args:
-        views: At least one.
-        whites: References of all views, or one a view.
-        darks: Each dark frame with a view or a white that it is subtracted from.
-        is_bent: Whether the files are pictures for people, in which twice the exposure is not twice the number.
-        may_be_finished: Whether values look like reflectances, which nothing is divided by but a reference.
-        notes, warnings: What was done, and what may be wrong, is appended.
-    """
-    files = (*views, *whites)
-    known, of_whites = (
-        [e for file in some if (e := exposure_of(file)) is not None] for some in (views, whites)
-    )
-    differs = len({tuple(exposure) for exposure in known}) > 1 or any(len(exposure) > 1 for exposure in known)
-    apertures = {"f_number" in file.metadata for file in files if exposure_of(file) is not None}
-    unit = "s times gain over the square of the f-number" if True in apertures else "s times gain"
-    taken = f"were exposed {_in_words(known)} {unit}" if known else ""
-    finished = [finished_by(file, by_name=not whites) for file in views]
-    if None not in finished and not is_bent:
-        kept = f"values are not divided by that, as {finished[0]} says that they are reflectance or radiance already"
-        notes += [f"views {taken}: {kept}"] if differs else []
-        return None
-    misfits, why = _misfits(views, whites), None
-    warnings += [*_missing_units(files), *misfits]
-    if len(known) < len(views):
-        missing = counted(len(views) - len(known), "view")
-        is_partial = bool(known or of_whites) and not misfits
-        why = f"{missing} without exposure time: exposures are not compared" * is_partial
-    elif len(apertures) > 1:
-        lacking = name_some([file.path.name for file in files if "f_number" not in file.metadata])
-        unknown = f"the f-number of the lens is known of some files and not of {lacking}"
-        why = f"{unknown}: exposures are not compared; write it into all, or none"
-    elif is_bent:
-        bent = "which can't be undone as cameras bend the brightness of pictures: fix the exposure"
-        why = f"pictures {taken}, {bent}" * differs
-    elif may_be_finished and differs and not (whites or darks):
-        why = (
-            f"views {taken}: values are not divided by that, as they are at most about 1 and taken for reflectances. "
-            "If they grow with the exposure, as raw numbers do, give a white reference, or divide them by it yourself"
-        )
-    if why is not None:
-        warnings += filter(None, [why])
-        return None
-    if len(of_whites) < len(whites) and differs and not misfits:
-        warnings.append(
-            f"views {taken}, the white reference does not say how long: reflectances may be off by a factor"
-        )
-    warnings += _unlike_darks(darks)
-    common, of_whom = np.median(known[0], keepdims=True), "the first view"
-    if of_whites:
-        common, of_whom = of_whites[0], f"{'the' if len(whites) == 1 else 'its'} white reference"
-    if len({tuple(exposure) for exposure in [*known, *of_whites, common]}) > 1:
-        notes.append(
-            f"views {taken}: each is brought to that of {of_whom}, {_in_words(of_whites or [common])}"
-        )
-    return common
-
-
-def _unlike_darks(darks: Sequence[tuple[SpectralFile, SpectralFile]]) -> list[str]:
-    """A warning of dark frames that were exposed otherwise than what they are subtracted from."""
-    pairs = [(exposure_of(dark, False), exposure_of(other, False)) for dark, other in darks]
-    unlike = [(a, b) for a, b in pairs if a is not None and b is not None and not np.array_equal(a, b)]
-    if not unlike:
-        return []
-    of_darks, of_others = (_in_words(exposures) for exposures in zip(*unlike, strict=True))
-    said = f"the dark frame was exposed {of_darks} s times gain, what it is subtracted from {of_others}"
-    return [f"{said}: dark current grows with exposure, so take a dark frame at each"]
-
-
-def _in_words(exposures: Iterable[Float64[np.ndarray, " _"]]) -> str:
-    """The range of exposures.
-
-    >>> _in_words([np.array([0.01]), np.array([0.02])])
-    '0.01 to 0.02'
-    """
-    every = np.concatenate(list(exposures))
-    low, high = every.min(), every.max()
-    return f"{low:g}" if low == high else f"{low:g} to {high:g}"
-
-
-def _misfits(views: Sequence[SpectralFile], whites: Sequence[SpectralFile]) -> list[str]:
-    """A warning where exposures are neither one number nor one a band, unless a white has the same ones."""
-    files = (*views, *whites)
-    stated = {repr((file.metadata.get("exposure_s"), file.metadata.get("gain"))) for file in files}
-    if whites and len(stated) == 1:
-        return []
-    found: dict[str, tuple[int, int]] = {}
-    for file in files:
-        sizes = {np.size(file.metadata.get(name, 1.0)) for name in ("exposure_s", "gain")}
-        if (odd := sizes - {1, file.shape[2]}) and "exposure_s" in file.metadata:
-            found[file.path.name] = max(odd), file.shape[2]
-    if not found:
-        return []
-    numbers = " or ".join(str(size) for size in sorted({size for size, _ in found.values()}))
-    bands = counted(next(iter(found.values()))[1], "band")
-    said = f"{name_some([*found])}: {numbers} exposure times or gains for {bands}"
-    advice = "Give one number, or one a band, with points as decimal marks"
-    return [f"{said}: exposures may differ and were not compared. {advice}"]
-
-
-def _missing_units(files: Iterable[SpectralFile]) -> list[str]:
-    """Warnings where units are missing and matter."""
-    metadata = [file.metadata for file in files if "exposure_s" in file.metadata]
-    warnings = []
-    for what, kind in (("exposure", "exposure times"), ("gain", "gains")):
-        evidence = sorted({str(own.get(f"{what}_evidence", "")) for own in metadata} - {""})
-        guessed = [text for text in evidence if "no unit" in text]
-        gains = {repr(own.get("gain", 1.0)) for own in metadata}
-        if guessed and (len(guessed) < len(evidence) if what == "exposure" else len(gains) > 1):
-            warnings.append(
-                f"{kind} have no unit in some files ({'; '.join(evidence)}): values may be off by a factor"
-            )
-    return warnings

@@ -16,7 +16,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Shaped
 
-from unmix_plugin.captures.calibration.calibration import Calibration, Raster, compare_exposures
+from unmix_plugin.captures.calibration.calibration import Calibration, Raster
+from unmix_plugin.captures.calibration.exposures import ExposedFiles, compare_exposures
 from unmix_plugin.captures.calibration.references import (
     Reference,
     References,
@@ -28,9 +29,10 @@ from unmix_plugin.captures.calibration.references import (
 )
 from unmix_plugin.captures.camera_tags import radiometric_model
 from unmix_plugin.captures.options import ProcessOptions
+from unmix_plugin.captures.report import Code, Remark
 from unmix_plugin.captures.spectral_file import MOST_WIDTH, BandIndex, CaptureView, SpectralFile
 from unmix_plugin.captures.wavelengths import in_ranges
-from unmix_plugin.errors import CaptureError, name_some
+from unmix_plugin.errors import CaptureError
 
 _ROWS_A_VIEW = 12
 _MOST_ALIKE = 4
@@ -140,9 +142,7 @@ class Sensor:
     """What was decided and from what, for the record."""
     lamp: Float64[np.ndarray, " c"] | None = None
     """Light on the white panel as the detector sees it, greatest value 1."""
-    notes: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
-    """What may make values wrong, one sentence each."""
+    remarks: tuple[Remark, ...] = ()
     is_stated: bool = False
     """Whether a white reference or the files say what 1 is, which dividing values loses."""
     is_reflectance: bool = False
@@ -175,7 +175,8 @@ def prepare_sensor(
     files = [view.cube for view in views]
     first, binning = files[0], options.bin_bands
     model = radiometric_model(first)
-    choice, notes, warnings = _stated_bands(files, options), [], []
+    choice = _stated_bands(files, options)
+    remarks: list[Remark] = []
     (dark, white), own = find_references(views, choice.wavelengths_nm, options, references, all_views)
     pairs = list(own.values()) or [(dark, white)]
     whites = [one for _, one in pairs if one is not None]
@@ -188,7 +189,7 @@ def prepare_sensor(
     lamp = None
     for used in whites:
         lamp = used.signal / used.reflectance if lamp is None else lamp
-        choice = _lit_bands(choice, used, saturation, warnings)
+        choice = _lit_bands(choice, used, saturation, remarks)
     choice.require(binning, str(first.path))
     exposure = None
     if model is None:  # a maker's calibration accounts for exposures already
@@ -197,12 +198,15 @@ def prepare_sensor(
             its_dark, used = own.get(file.path, (dark, white))
             darks += [(its_dark.file, file)] if its_dark else []
             darks += [(used.dark.file, used.file)] if used and used.dark else []
-        of_whites, finished = [one.file for one in whites], may_be_reflectance(first)
-        exposure = compare_exposures(files, of_whites, darks, is_srgb(first), finished, notes, warnings)
+        of_whites = [one.file for one in whites]
+        exposed = ExposedFiles(files, of_whites, darks, is_srgb(first), may_be_reflectance(first))
+        compared = compare_exposures(exposed)
+        exposure = compared.common
+        remarks += compared.remarks
     raster = Raster.of(first.shape[0], first.shape[1], options.crop, options.bin_pixels)
     calibration = Calibration(raster, choice.kept, 1, dark, white, saturation, exposure, own)
     sample = _draw_sample(files, calibration)
-    choice = _drop_found(choice, sample, options.max_noise, notes)
+    choice = _drop_found(choice, sample, options.max_noise, remarks)
     choice = choice.without_incomplete_bins(binning)
     choice.require(binning, str(first.path))
     still_kept = np.isin(calibration.bands, choice.kept)
@@ -226,8 +230,7 @@ def prepare_sensor(
         sample[0][:, still_kept].reshape(len(sample[0]), -1, binning).mean(axis=2),
         evidence | _evidence(views, choice, (dark, white), own),
         lamp,
-        tuple(notes),
-        tuple(warnings),
+        tuple(remarks),
         bool(whites) or states_one,
         bool(whites) or (has_one and finished is not None),
         float(np.percentile(at_end, _FEW_PERCENTILE)) if len(at_end) else np.inf,
@@ -317,8 +320,11 @@ def _find_saturation(files: Sequence[SpectralFile], bands: np.ndarray) -> tuple[
     low, high = int(limits.min), int(limits.max)
     counts = np.zeros(high - low + 1, dtype=np.int64)
     rows = sampled_rows(files[0].shape[0])
-    parts = [file.read(slice(row, row + 1), bands)[0] for file, row in product(files[:_MOST_ALIKE], rows)]
-    bands = bands[np.ptp(np.concatenate(parts), axis=0) > 0]
+    parts = [_stored_pixels(file, row, bands) for file, row in product(files[:_MOST_ALIKE], rows)]
+    known = np.concatenate(parts)
+    if not len(known):
+        return None, "none: no sampled pixel has a measurement"
+    bands = bands[np.ptp(known, axis=0) > 0]
     if not len(bands):
         return None, "none: every band has one value only"
     for file, row in product(files, rows):
@@ -345,18 +351,17 @@ def _stored_pixels(file: SpectralFile, row: int, bands: BandIndex = slice(None))
 
 
 def _lit_bands(
-    choice: _BandChoice, white: Reference, saturation: float | None, warnings: list[str]
+    choice: _BandChoice, white: Reference, saturation: float | None, remarks: list[Remark]
 ) -> _BandChoice:
     """The choice without bands in which a white reference is saturated, marked as bad, or has no light."""
     clipped, path = _clipped_bands(white, saturation), white.file.path
-    advice = "take it again with a shorter exposure"
     if clipped.mean() > _MOST_SATURATED_WHITE:
-        raise CaptureError(f"{path}: {clipped.mean():.0%} of the white reference is saturated; {advice}")
-    if clipped.any():
-        listed = name_some([f"{nm:g} nm" for nm in choice.wavelengths_nm[clipped]])
-        warnings.append(
-            f"{path.name}: the white is saturated in {listed}: these bands are left out; {advice}"
+        raise CaptureError(
+            f"{path}: {clipped.mean():.0%} of the white reference is saturated; take it again with a shorter exposure"
         )
+    if clipped.any():
+        listed = [f"{nm:g} nm" for nm in choice.wavelengths_nm[clipped]]
+        remarks.append(Remark.of(Code.WHITE_SATURATED, file=path.name, bands=listed))
     choice = choice.without(clipped, "the white reference is saturated there")
     if white.file.bands.bad is not None:
         choice = choice.without(white.file.bands.bad, "marked as bad in the white reference")
@@ -418,7 +423,7 @@ def _draw_sample(files: Sequence[SpectralFile], calibration: Calibration) -> _Sa
     return sample
 
 
-def _drop_found(choice: _BandChoice, sample: _Sample, max_noise: float, notes: list[str]) -> _BandChoice:
+def _drop_found(choice: _BandChoice, sample: _Sample, max_noise: float, remarks: list[Remark]) -> _BandChoice:
     """Leave out bands that are dead, saturated or noisy in the sample, which has all that were kept."""
     kept, (values, saturated) = choice.kept, sample
     shares = saturated.mean(axis=0)
@@ -429,8 +434,8 @@ def _drop_found(choice: _BandChoice, sample: _Sample, max_noise: float, notes: l
     noise[~is_dead] = _noise_shares(values[usable][:, ~is_dead])
     is_noisy = noise > max_noise  # false for NaN
     if is_noisy.mean() > _MOST_NOISY:  # bands have little in common then, or the whole capture is noisy
-        noisy = f"{is_noisy.sum()} of {len(kept)} bands have noise above {max_noise:.0%} of their signal"
-        notes.append(f"{noisy}; all are kept")
+        values = {"noisy": int(is_noisy.sum()), "bands": len(kept), "limit": f"{max_noise:.0%}"}
+        remarks.append(Remark.of(Code.NOISY_BANDS_KEPT, **values))
         is_noisy[:] = False
     # The first reason that is found counts.
     reasons = {int(kept[i]): f"noise is {noise[i]:.0%} of the signal" for i in np.flatnonzero(is_noisy)}

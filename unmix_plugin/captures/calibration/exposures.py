@@ -1,0 +1,197 @@
+"""How long views and their references were exposed, and what values are brought to.
+
+The exposure of a file is its time times the gain, over the square of the f-number: what the numbers of one scene grow
+with. A factor that one file states and another lacks is taken for 1 nowhere without a warning.
+
+Notation: `b` is 1, or the bands of a file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float64
+
+from unmix_plugin.captures.calibration.references import finished_by
+from unmix_plugin.captures.report import Code, Remark
+from unmix_plugin.captures.spectral_file import SpectralFile
+
+_LIGHT = "s times gain over the square of the f-number"
+_CURRENT = "s times gain"
+"""What is counted: of light, and where no file states an f-number."""
+
+
+def exposure_of(file: SpectralFile, to_light: bool = True) -> Float64[np.ndarray, " b"] | None:
+    """Exposure time times gain, and over the square of the f-number if that is known, one number or one a band; None
+    where the file does not say the time.
+
+    Args:
+        to_light: Whether the aperture counts, which lets in light but no dark current.
+    """
+    time, gain = file.metadata.get("exposure_s"), file.metadata.get("gain", 1.0)
+    f_number = file.metadata.get("f_number", 1.0) if to_light else 1.0
+    try:
+        exposure = np.asarray(time, dtype=np.float64) * np.asarray(gain, dtype=np.float64)
+        exposure = np.atleast_1d(exposure / f_number**2)
+    except (TypeError, ValueError):
+        return None
+    is_usable = len(exposure) in (1, file.shape[2]) and np.isfinite(exposure).all() and (exposure > 0).all()
+    return exposure if is_usable else None
+
+
+@dataclass(frozen=True)
+class ExposedFiles:
+    """Files whose exposures are compared: of one sensor, or one file of each of several."""
+
+    views: Sequence[SpectralFile]
+    """At least one."""
+    whites: Sequence[SpectralFile] = ()
+    """References of all views, or one a view."""
+    darks: Sequence[tuple[SpectralFile, SpectralFile]] = ()
+    """Each dark frame with a view or a white that it is subtracted from."""
+    is_srgb: bool = False
+    """Whether the files are pictures for people, in which twice the exposure is not twice the number."""
+    may_be_reflectance: bool = False
+    """Whether values look like reflectances, which nothing is divided by but a reference."""
+
+    @cached_property
+    def known(self) -> list[Float64[np.ndarray, " b"]]:
+        """Exposures of the views that state one."""
+        return [exposure for file in self.views if (exposure := exposure_of(file)) is not None]
+
+    @cached_property
+    def of_whites(self) -> list[Float64[np.ndarray, " b"]]:
+        """Exposures of the white references that state one."""
+        return [exposure for file in self.whites if (exposure := exposure_of(file)) is not None]
+
+    @property
+    def stating(self) -> list[SpectralFile]:
+        """Views and whites that state an exposure."""
+        return [file for file in (*self.views, *self.whites) if exposure_of(file) is not None]
+
+    @property
+    def differ(self) -> bool:
+        """Whether the views were exposed differently, or their bands."""
+        return len({tuple(one) for one in self.known}) > 1 or any(len(one) > 1 for one in self.known)
+
+    @property
+    def said(self) -> dict[str, str]:
+        """The exposures of the views, for sentences."""
+        has_aperture = any("f_number" in file.metadata for file in self.stating)
+        return {"exposed": _range(self.known), "unit": _LIGHT if has_aperture else _CURRENT}
+
+    def lacking(self, factor: str) -> list[SpectralFile]:
+        """Files without a factor of the exposure that others of those with a time state."""
+        without = [file for file in self.stating if factor not in file.metadata]
+        return without if len(without) < len(self.stating) else []
+
+
+@dataclass(frozen=True)
+class ComparedExposures:
+    """What exposures were found, and what follows."""
+
+    common: Float64[np.ndarray, " b"] | None = None
+    """What all views are brought to: the exposure of the white reference, otherwise of the first view; None where
+    exposures are not compared."""
+    remarks: tuple[Remark, ...] = ()
+
+
+def compare_exposures(files: ExposedFiles) -> ComparedExposures:
+    """What the views are brought to, and what may be wrong with that."""
+    finished = [finished_by(file, by_name=not files.whites) for file in files.views]
+    if None not in finished and not files.is_srgb:
+        kept = Remark.of(Code.EXPOSURE_COUNTED_BEFORE, **files.said, source=finished[0])
+        return ComparedExposures(None, (kept,) if files.differ else ())
+    misfits = _misfits(files)
+    doubts = [*_missing_units((*files.views, *files.whites)), *misfits]
+    why = _why_not(files, bool(misfits))
+    if why is not None:
+        return ComparedExposures(None, (*doubts, *why))
+    if files.known and len(files.of_whites) < len(files.whites) and not misfits:
+        doubts.append(Remark.of(Code.WHITE_EXPOSURE_UNKNOWN, **files.said))
+    if lacking := files.lacking("gain"):
+        doubts.append(Remark.of(Code.GAIN_TAKEN_AS_ONE, lacking=[file.path.name for file in lacking]))
+    doubts += _unlike_darks(files.darks)
+    common, of_whom = np.median(files.known[0], keepdims=True), "the first view"
+    if files.of_whites:
+        common, of_whom = files.of_whites[0], f"{'the' if len(files.whites) == 1 else 'its'} white reference"
+    if len({tuple(exposure) for exposure in [*files.known, *files.of_whites, common]}) > 1:
+        to = _range(files.of_whites or [common])
+        doubts.append(Remark.of(Code.EXPOSURES_EVENED, **files.said, whose=of_whom, common=to))
+    return ComparedExposures(common, tuple(doubts))
+
+
+def _why_not(files: ExposedFiles, has_misfits: bool) -> list[Remark] | None:
+    """Why exposures are not compared, or nothing where that does no harm; None where they are."""
+    missing = len(files.views) - len(files.known)
+    if missing:
+        is_partial = bool(files.known or files.of_whites) and not has_misfits
+        return [Remark.of(Code.EXPOSURE_UNKNOWN, missing=missing)] if is_partial else []
+    for factor, name in (("f_number", "f-number of the lens"), ("gain", "gain")):
+        lacking = files.lacking(factor)
+        others = [file.metadata[factor] for file in files.stating if factor in file.metadata]
+        if lacking and (
+            factor == "f_number" or np.any(np.concatenate([np.ravel(one) for one in others]) != 1)
+        ):
+            names = [file.path.name for file in lacking]
+            return [Remark.of(Code.EXPOSURE_FACTOR_UNKNOWN, factor=name, lacking=names)]
+    if files.is_srgb:
+        return [Remark.of(Code.EXPOSURES_OF_PICTURES, **files.said)] if files.differ else []
+    if files.may_be_reflectance and files.differ and not (files.whites or files.darks):
+        return [Remark.of(Code.EXPOSURES_OF_REFLECTANCES, **files.said)]
+    return None
+
+
+def _unlike_darks(darks: Sequence[tuple[SpectralFile, SpectralFile]]) -> list[Remark]:
+    """A warning of dark frames that were exposed otherwise than what they are subtracted from."""
+    pairs = [(exposure_of(dark, False), exposure_of(other, False)) for dark, other in darks]
+    unlike = [(a, b) for a, b in pairs if a is not None and b is not None and not np.array_equal(a, b)]
+    if not unlike:
+        return []
+    of_darks, of_others = (_range(exposures) for exposures in zip(*unlike, strict=True))
+    return [Remark.of(Code.DARK_EXPOSED_OTHERWISE, of_dark=of_darks, of_others=of_others)]
+
+
+def _range(exposures: Iterable[Float64[np.ndarray, " _"]]) -> str:
+    """The range of exposures in words; empty where there are none.
+
+    >>> _range([np.array([0.01]), np.array([0.02])])
+    '0.01 to 0.02'
+    """
+    every = [*exposures]
+    if not every:
+        return ""
+    low, high = np.concatenate(every).min(), np.concatenate(every).max()
+    return f"{low:g}" if low == high else f"{low:g} to {high:g}"
+
+
+def _misfits(files: ExposedFiles) -> list[Remark]:
+    """A warning where exposures are neither one number nor one a band, unless a white has the same ones."""
+    every = (*files.views, *files.whites)
+    stated = {repr((file.metadata.get("exposure_s"), file.metadata.get("gain"))) for file in every}
+    if files.whites and len(stated) == 1:
+        return []
+    found: dict[str, tuple[int, int]] = {}
+    for file in every:
+        sizes = {np.size(file.metadata.get(name, 1.0)) for name in ("exposure_s", "gain")}
+        if (odd := sizes - {1, file.shape[2]}) and "exposure_s" in file.metadata:
+            found[file.path.name] = max(odd), file.shape[2]
+    if not found:
+        return []
+    numbers = " or ".join(str(size) for size in sorted({size for size, _ in found.values()}))
+    bands = next(iter(found.values()))[1]
+    return [Remark.of(Code.EXPOSURES_MISFIT, [*found], numbers=numbers, bands=bands)]
+
+
+def _missing_units(files: Iterable[SpectralFile]) -> Iterator[Remark]:
+    """Warnings where units are missing and matter."""
+    metadata = [file.metadata for file in files if "exposure_s" in file.metadata]
+    for what, factor in (("exposure", "exposure times"), ("gain", "gains")):
+        evidence = sorted({str(own.get(f"{what}_evidence", "")) for own in metadata} - {""})
+        guessed = [text for text in evidence if "no unit" in text]
+        gains = {repr(own.get("gain", 1.0)) for own in metadata}
+        if guessed and (len(guessed) < len(evidence) if what == "exposure" else len(gains) > 1):
+            yield Remark.of(Code.EXPOSURE_UNITS_MISSING, factor=factor, evidence="; ".join(evidence))
