@@ -171,6 +171,14 @@ def test_a_view_that_matter_fills_keeps_all_of_it():
     assert seen is None or not seen.shown.any()
 
 
+def test_a_view_without_any_surface_at_its_border_is_judged_with_the_others():
+    """As a printed floor fills one view, which the others show beside a plain wall."""
+    images, _ = pictures(BACKDROPS["grey"])
+    printed = np.random.default_rng(1).uniform(0, 1, (HEIGHT, WIDTH, BANDS)).astype(np.float32)
+    assert judge([printed, *images[1:]]) is not None
+    assert judge([printed, printed[::-1], *images[3:]]) is None
+
+
 @pytest.mark.parametrize("is_plain", [False, True])
 def test_matter_that_reaches_the_border_stays(is_plain: bool):
     """A dark pot that the picture's lower edge cuts off is no second surface, even where it reaches a corner, nor are

@@ -79,7 +79,7 @@ class FittedView:
             seen, own = self.features[corner], terms[corner]
             away = [norm(seen - own @ each.coefficients) / each.tolerance for each in self.surfaces]
             nearest = np.min(away, axis=0, initial=1.0)
-            found |= [bool((one <= nearest).mean() > 0.5) for one in away]
+            found |= np.array([(one <= nearest).mean() > 0.5 for one in away], bool)
         return found.tolist()
 
     def look(self) -> LookedAt:

@@ -1,0 +1,68 @@
+"""What a command decided from data on its own: the outcome, the evidence, what would have refuted it, and the flag that
+overrides it.
+
+A guess is a hypothesis. Whoever makes one tries what would refute it before it has any effect, and `UNDECIDED` is an
+answer: then the safer course is taken, and the table says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+UNDECIDED = "undecided"
+"""The outcome of a decision whose evidence speaks for neither side."""
+
+
+@dataclass(frozen=True)
+class Decision:
+    """One automatic decision; code asks `subject`, `outcome` and `evidence`, people read all five."""
+
+    subject: str
+    """What was decided, such as `world`; one name in all commands."""
+    outcome: str
+    """What was chosen, such as `bounded`, or `UNDECIDED`."""
+    evidence: Mapping[str, float | int | bool | str] = field(default_factory=dict)
+    """Measured values by what they measure, the decisive ones first."""
+    refuted_by: str = ""
+    """What would have spoken against the outcome, and was looked for."""
+    flag: str = ""
+    """The option that overrides it."""
+
+    @property
+    def is_undecided(self) -> bool:
+        """Whether the evidence spoke for neither side."""
+        return self.outcome == UNDECIDED
+
+    def to_json(self) -> dict[str, Any]:
+        """For a record."""
+        return {**asdict(self), "evidence": dict(self.evidence)}
+
+
+def decision_table(decisions: Sequence[Decision]) -> list[str]:
+    """Lines of a table for people, a decision a block.
+
+    >>> print(
+    ...     *decision_table([Decision("world", "bounded", {"behind the box": 0.02}, "more", "--world")]),
+    ...     sep="\\n",
+    ... )
+    world  bounded
+           because  behind the box 0.02
+           against  more
+           change   --world
+    """
+    width = max((len(each.subject) for each in decisions), default=0) + 2
+    lines = []
+    for each in decisions:
+        lines.append(f"{each.subject:<{width}}{each.outcome}")
+        values = ", ".join(f"{name} {_written(value)}" for name, value in each.evidence.items())
+        details = (("because", values), ("against", each.refuted_by), ("change", each.flag))
+        lines += [f"{'':<{width}}{name:<9}{text}" for name, text in details if text]
+    return lines
+
+
+def _written(value: float | bool | str) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
