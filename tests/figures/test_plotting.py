@@ -6,8 +6,11 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from matplotlib.figure import Figure
 
 from unmix_plugin.figures import plotting
+from unmix_plugin.figures.pictures import ColourScale, TitledPicture, draw_panels
+from unmix_plugin.products.endmembers import draw_spectra
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import srgb_to_linear
 
@@ -104,3 +107,20 @@ def test_a_materials_own_colour_is_that_of_its_spectrum():
     colours = plotting.own_colours(torch.stack([white, black, red, blue]), BANDS)
     np.testing.assert_allclose(colours[:2], [[1.0] * 3, [0.0] * 3], atol=1e-6)
     assert colours[2:].argmax(axis=1).tolist() == [0, 2]
+
+
+@pytest.mark.parametrize("name", ["5$ leaf $", "$\\frac$", "a $ b $ c $", "_leaf", "100 % $^{x$"])
+def test_names_are_drawn_as_they_are_and_never_read_as_formulas(name):
+    panel = TitledPicture(np.zeros((4, 4, 3)), name, (1.0, 0.0, 0.0))
+    scale = ColourScale("viridis", 0.0, 1.0, name)
+    assert draw_panels([[panel]], name, scale, [(name, (0.0, 1.0, 0.0))]).startswith(b"\x89PNG")
+    assert b"<svg" in plotting.draw_chart(
+        plotting.SpectraChart([plotting.ChartLine(np.arange(3), np.ones(3), name, "#000000")], name)
+    )
+    spectra, x = np.ones((2, 3)), np.arange(3)
+    colours = np.array([[1.0, 0, 0], [0, 1.0, 0]])
+    assert draw_spectra(spectra, x, [name, "other"], colours, (name, name)).startswith(b"\x89PNG")
+    as_named, by_letter = Figure(), Figure()
+    as_named.text(0.1, 0.1, plotting.plot_text(name))
+    by_letter.text(0.1, 0.1, f" {name}" if name[0] == "_" else name, parse_math=False)
+    assert plotting.figure_bytes(as_named) == plotting.figure_bytes(by_letter)

@@ -57,7 +57,15 @@ def test_small_pictures_and_labels_are_sent_without_loss_and_large_ones_compress
     labels = show_layer(page, "segmentation").reshape(-1, 3).astype(int)
     assert page.last_picture.startswith(b"\x89PNG")
     materials = viewer.services.maker.edited(Edit()).materials
-    colours = (viewer.services.maker.aids.for_layers().colours_of(materials) * 255).round().int().tolist()
+    colours = (
+        (
+            viewer.services.maker.aids.for_layers(viewer.services.maker.edited(Edit())).colours_of(materials)
+            * 255
+        )
+        .round()
+        .int()
+        .tolist()
+    )
     background = [round(255 * BACKGROUNDS["grey"])] * 3
     assert {*map(tuple, labels.tolist())} <= {*map(tuple, [*colours, background])}
 
@@ -129,8 +137,9 @@ def test_the_point_cloud_follows_the_light_and_shows_no_hidden_material(viewer, 
     page.wait_until(lambda: len(clouds) == 2 and "illuminant: A" in recipe["value"])
     (points, colours), (same, relit) = clouds
     maker = viewer.services.maker
-    materials = maker.edited(Edit()).materials
-    linear = maker.aids.for_layers().reference_spectra(materials) @ rgb_matrix(materials.bands)
+    scene = maker.edited(Edit())
+    materials = scene.materials
+    linear = maker.aids.for_layers(scene).reference_spectra(materials) @ rgb_matrix(materials.bands)
     assert np.array_equal(colours, eight_bits(linear_to_srgb(linear.clamp(0, 1)).numpy()))
     assert np.array_equal(points, same)
     assert relit[:, 2].mean() < colours[:, 2].mean() - 5

@@ -60,7 +60,6 @@ from unmix_plugin.editing.recipe import (
     Swap,
 )
 from unmix_plugin.errors import ConfigError, SpectrumError, UnmixError
-from unmix_plugin.field import CoefficientField
 from unmix_plugin.figures.plotting import css_colour
 from unmix_plugin.formats.libraries import read_library
 from unmix_plugin.spectral.bands import Bands
@@ -350,7 +349,7 @@ def edit_scene(
         where = recipe.where(position)
         looks = isinstance(operation, Retint) and operation.match == "picture"
         if looks and state.visibility != seen_as:
-            state.seen, seen_as = see(replace(scene, field=_field(scene, state))), state.visibility
+            state.seen, seen_as = see(_with_visibility(scene, state)), state.visibility
         try:
             _HANDLERS[type(operation)](state, operation, where)
         except UnmixError as error:
@@ -373,7 +372,7 @@ def edit_scene(
         )
     assumed = assumption_of_light(scene, recipe)
     notes = [*scene.notes, *([] if assumed is None else [assumed]), *state.notes, *told]
-    return replace(scene, field=_field(scene, state), materials=materials, notes=tuple(notes))
+    return replace(_with_visibility(scene, state), materials=materials, notes=tuple(notes))
 
 
 def _require_names_that_differ(state: MaterialState, recipe: Recipe) -> None:
@@ -387,14 +386,16 @@ def _require_names_that_differ(state: MaterialState, recipe: Recipe) -> None:
             )
 
 
-def _field(scene: TrainedScene, state: MaterialState) -> CoefficientField:
-    """That of the scene without what is removed, and with the gloss of each material."""
+def _with_visibility(scene: TrainedScene, state: MaterialState) -> TrainedScene:
+    """The scene without what is removed, and with the gloss of each material."""
     _, gloss = state.mirrored()
     if gloss is None and state.is_kept.all():
-        return scene.field
+        return scene
     shine = np.ones((1, len(state.gloss))) if gloss is None else gloss
     edited = EditedField.over(scene.field, torch.from_numpy(state.is_kept), torch.from_numpy(shine).float())
-    return edited.to(scene.device)
+    return replace(
+        scene, field=edited.to(scene.device), visibility=edited.visibility, has_removed=edited.removes
+    )
 
 
 def changes_geometry(recipe: Recipe) -> bool:

@@ -244,7 +244,7 @@ class EditedField(CoefficientField):
         """Whether any endmember is transparent."""
 
     @property
-    def change(self) -> tuple[bytes, bytes]:
+    def visibility(self) -> tuple[bytes, bytes]:
         """Equal where the same is removed, and the gloss is the same."""
         return self.is_kept.cpu().numpy().tobytes(), self.gloss.cpu().numpy().tobytes()
 

@@ -27,6 +27,7 @@ from unmix_plugin.figures.plotting import (
     draw_swatch,
     figure_bytes,
     page_in_inches,
+    plot_text,
 )
 from unmix_plugin.formats.files import rgba_png_bytes
 from unmix_plugin.spectral.colour.srgb import decode_srgb, encode_srgb
@@ -130,7 +131,7 @@ def draw_panels(
     grid_height = len(rows) * (size[1] + _TITLE + _GAP) - _GAP
     top = _MARGIN + below + grid_height + _HEADING
     figure, page = page_in_inches(inner_width + 2 * _MARGIN, top + _MARGIN)
-    page.text(_MARGIN, top, heading, fontsize=_FONT_PT + 2, fontweight="bold", va="top")
+    page.text(_MARGIN, top, plot_text(heading), fontsize=_FONT_PT + 2, fontweight="bold", va="top")
     for row, panels in enumerate(rows):
         bottom = top - _HEADING - (row + 1) * (size[1] + _TITLE) - row * _GAP
         for column, panel in enumerate(panels):
@@ -138,7 +139,7 @@ def draw_panels(
     if scale is not None:
         box = (_MARGIN + grid_width + 0.18, _MARGIN + below, _BAR_WIDTH, grid_height - _TITLE)
         drawn = draw_colour_bar(page, box, scale.colour_map, (scale.low, scale.high))
-        drawn.set_label(scale.label, fontsize=_FONT_PT)
+        drawn.set_label(plot_text(scale.label), fontsize=_FONT_PT)
         drawn.ax.tick_params(labelsize=_FONT_PT - 1)
         drawn.locator = MaxNLocator(5)
     draw_legend_entries(page, legend, (_MARGIN, _MARGIN + below - _GAP), inner_width)
@@ -159,7 +160,7 @@ def draw_legend_entries(
         row, column = divmod(index, columns)
         left, base = corner[0] + column * _entry_width(legend), corner[1] - (row + 1) * _LEGEND_ROW
         draw_swatch(page, colour, (left, base + 0.02))
-        page.text(left + 0.24, base + 0.03, name, fontsize=_FONT_PT, va="bottom")
+        page.text(left + 0.24, base + 0.03, plot_text(name), fontsize=_FONT_PT, va="bottom")
 
 
 def one_above_the_other(paths: Sequence[Path], captions: Sequence[str]) -> bytes:
@@ -198,7 +199,7 @@ def _draw_panel(
         draw_swatch(page, panel.swatch, (left, base))
         left, width = left + 0.22, width - 0.22
     title = textwrap.shorten(panel.title, max(8, int(width / _LETTER)), placeholder="...")
-    page.text(left, base, title, fontsize=_FONT_PT, va="bottom")
+    page.text(left, base, plot_text(title), fontsize=_FONT_PT, va="bottom")
 
 
 def _entry_width(legend: Sequence[tuple[str, Colour]]) -> float:

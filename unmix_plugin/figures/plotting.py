@@ -47,6 +47,17 @@ def css_colour(srgb: Colour) -> str:
     return "#" + "".join(f"{round(255 * min(max(float(value), 0.0), 1.0)):02x}" for value in srgb)
 
 
+def plot_text(text: str) -> str:
+    """A text of a user or a file as matplotlib draws it letter by letter: it takes what stands between two `$` for a
+    formula, and leaves labels that begin with `_` out of legends.
+
+    >>> print(plot_text("5$ a_1 $"), plot_text("_leaf"))
+    5\\$ a_1 \\$  _leaf
+    """
+    escaped = text.replace("$", r"\$")
+    return f" {escaped}" if escaped.startswith("_") else escaped
+
+
 def page_in_inches(width: float, height: float) -> tuple[Any, Any]:
     """A white figure, and axes without ticks that fill it, whose unit is an inch: whatever is placed on them lies where
     it is said to."""
@@ -149,7 +160,7 @@ def draw_chart(chart: SpectraChart) -> bytes:
         mark_lone_points(axes)
         axes.margins(x=0)
         axes.set_xlabel("wavelength (nm)", color=_INK)
-        axes.set_ylabel(chart.label, color=_INK)
+        axes.set_ylabel(plot_text(chart.label), color=_INK)
         axes.tick_params(which="both", colors=_SOFT)
         plain_axes(axes)
         buffer = io.BytesIO()

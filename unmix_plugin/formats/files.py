@@ -5,10 +5,9 @@ Notation: `H x W` pixels, `N` colours.
 
 from __future__ import annotations
 
-import csv
 import io
 import os
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
@@ -26,6 +25,7 @@ from unmix_plugin.engine.runs.atomic_files import (  # noqa: F401 - some of them
     write_errors_as,
     write_file,
 )
+from unmix_plugin.engine.tables import csv_bytes  # noqa: F401 - for others, who take it from here
 from unmix_plugin.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -46,13 +46,6 @@ def refuse_to_overwrite(paths: Collection[Path], overwrite: bool) -> None:
     if existing and not overwrite:
         others = f" and {len(existing) - 1} more of its files exist" if len(existing) > 1 else " exists"
         raise ConfigError(f"{existing[0]}{others} already; give --overwrite or another folder")
-
-
-def csv_bytes(rows: Iterable[Sequence[object]]) -> bytes:
-    """A table as the bytes of a CSV file; numbers come as text in the precision wanted."""
-    text = io.StringIO(newline="")
-    csv.writer(text, lineterminator="\n").writerows(rows)
-    return text.getvalue().encode()
 
 
 def numbered_apart(names: Iterable[str]) -> list[str]:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Float64, Shaped
 
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.figures.plotting import figure_bytes, plain_axes
+from unmix_plugin.figures.plotting import figure_bytes, plain_axes, plot_text
 from unmix_plugin.formats.envi import envi_library_paths, write_envi_library
 from unmix_plugin.formats.files import csv_bytes, make_folder, write_file
 from unmix_plugin.formats.libraries import library_of
@@ -110,9 +110,9 @@ def draw_spectra(
             linewidth=2.0,
             marker="o" if len(x) <= 40 else None,
             markersize=3.5,
-            label=names[index],
+            label=plot_text(names[index]),
         )
-    axes.set(xlabel=labels[0], ylabel=labels[1])
+    axes.set(xlabel=plot_text(labels[0]), ylabel=plot_text(labels[1]))
     axes.set_ylim(bottom=0.0)
     axes.set_title("Endmembers", loc="left", fontweight="bold")
     plain_axes(axes)

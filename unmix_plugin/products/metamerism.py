@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from unmix_plugin.errors import SpectrumError
-from unmix_plugin.figures.plotting import draw_swatch, figure_bytes, page_in_inches
+from unmix_plugin.figures.plotting import draw_swatch, figure_bytes, page_in_inches, plot_text
 from unmix_plugin.formats.files import csv_bytes, write_file
 from unmix_plugin.formats.libraries import library_of
 from unmix_plugin.products.product import Job
@@ -104,12 +104,18 @@ def _draw_metamers(found: _Metamers) -> bytes:
     page.text(_MARGIN, top + _HEADING, heading, fontsize=11, fontweight="bold", va="top")
     labels = ["CIEDE2000 beside the swatches", *found.lights]
     for label, left in zip(labels, [_MARGIN, *columns], strict=False):
-        page.text(left, top + 0.07, label, fontsize=10, va="bottom")
+        page.text(left, top + 0.07, plot_text(label), fontsize=10, va="bottom")
     labs = [reflectance_to_lab(found.reflectance, power, found.bands) for power in found.powers]
     for row, pair in enumerate(drawn):
         base, surfaces = top - (row + 1) * _ROW, [pair.first, pair.second]
         for index, surface in enumerate(surfaces):
-            page.text(_MARGIN, base + 0.36 - 0.2 * index, found.names[surface][:42], fontsize=9, va="center")
+            page.text(
+                _MARGIN,
+                base + 0.36 - 0.2 * index,
+                plot_text(found.names[surface][:42]),
+                fontsize=9,
+                va="center",
+            )
         for left, lab, difference in zip(columns, labs, pair.differences, strict=False):
             for index, colour in enumerate(lab_to_srgb(lab[surfaces])):
                 draw_swatch(page, colour, (left + index * _SWATCH, base + 0.06), _SWATCH, "none")

@@ -19,7 +19,7 @@ from jaxtyping import Float
 
 from unmix_plugin.editing.recipe_files import read_recipe
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.figures.plotting import figure_bytes, mark_lone_points, plain_axes
+from unmix_plugin.figures.plotting import figure_bytes, mark_lone_points, plain_axes, plot_text
 from unmix_plugin.formats.envi import envi_library_paths, write_envi_library
 from unmix_plugin.formats.files import NOT_PORTABLE, make_folder, safe_name, write_file
 from unmix_plugin.formats.libraries import library_of
@@ -254,12 +254,12 @@ def _draw_spectrum(place: _ProbedPlace, materials: Materials) -> bytes:
     if spread is not None:
         lines.fill_between(wavelengths, mean - spread, mean + spread, color="0.85", label=label)
     for style, shown in zip(("--", "-.", ":"), place.matches, strict=False):
-        label = f"{shown.match.name} ({shown.match.angle_rad:.3f} rad)"
+        label = plot_text(f"{shown.match.name} ({shown.match.angle_rad:.3f} rad)")
         lines.plot(wavelengths, shown.spectrum, linestyle=style, linewidth=1.3, label=label)
     mark_lone_points(lines)
     lines.set(xlabel="wavelength (nm)", ylabel=f"{materials.quantity} (1 = full scale)")
     lines.set_ylim(bottom=0.0)
-    lines.set_title(place.title, loc="left", fontweight="bold")
+    lines.set_title(plot_text(place.title), loc="left", fontweight="bold")
     lines.legend(frameon=False)
     plain_axes(lines)
     _draw_abundances(bars, place.probe, materials)
@@ -278,7 +278,7 @@ def _draw_abundances(axes: Any, probe: Probe, materials: Materials) -> None:
         edgecolor="0.3",
         linewidth=0.6,
     )
-    axes.set_yticks(range(len(chosen)), [materials.names[index] for index in chosen])
+    axes.set_yticks(range(len(chosen)), [plot_text(materials.names[index]) for index in chosen])
     axes.invert_yaxis()
     axes.set_xlim(0.0, 1.0)
     axes.set_xlabel("abundance")

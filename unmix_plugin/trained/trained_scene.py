@@ -80,6 +80,11 @@ class TrainedScene:
     """Rays through a pixel along each of its edges."""
     notes: tuple[str, ...] = ()
     """What a user has to be told of how it was edited."""
+    visibility: tuple[bytes, bytes] | None = None
+    """What edits removed, and the specular factors of what is left; None: as trained. Coefficients of scenes of one run
+    fit each other where it is equal."""
+    has_removed: bool = False
+    """Whether edits removed a material."""
     fitted: tuple[Literal["pose", "gain"], ...] = ()
     """What training found for each of its views, so that other views are aligned before they are measured."""
     scale: Scale | None = None

@@ -334,8 +334,7 @@ class Session:
 
     def colours_of(self, materials: Materials) -> list[tuple[float, ...]]:
         """sRGB colours that stand for materials."""
-        aids = self.services.maker.aids.for_layers()
-        assert aids is not None
+        aids = self.services.maker.aids.for_layers(self.services.maker.edited(Edit()))
         return [tuple(row) for row in aids.colours_of(materials).tolist()]
 
     def change_edit(self, edit: Edit) -> None:

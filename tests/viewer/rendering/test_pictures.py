@@ -8,9 +8,13 @@ from hypothesis import strategies as st
 from torch.testing import assert_close
 
 from tests.viewer.view_factory import make_frame, make_source
+from unmix_plugin.editing import Recipe
+from unmix_plugin.editing.recipe import Gloss, Remove
 from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.rendering import pictures
+from unmix_plugin.viewer.rendering.scene import Edit
+from unmix_plugin.viewer.rendering.settings import LayerSettings
 from unmix_plugin.viewer.view_cameras import camera_of, pose_of
 
 
@@ -101,3 +105,19 @@ def test_depth_is_along_the_axis_where_something_is_and_far_elsewhere(source):
     depth, accumulation = pictures._picture_depth(fine), fine.coefficients.accumulation[1::2, 1::2].numpy()
     assert depth.shape == (150, fine.camera.width // 2)
     assert ((depth > 100) == (accumulation <= 0.5)).all()
+
+
+@pytest.mark.parametrize(
+    "edit", [Gloss(0, 0.5, (1.0, 0.8, 0.0)), Gloss(None, 1.0, (1.0, 0.8, 0.0)), Remove((1,))]
+)
+def test_every_layer_shows_edits_of_gloss_and_of_what_is_there(tmp_path, edit):
+    maker = pictures.PictureMaker(make_source(tmp_path))
+    change = Edit(Recipe((edit,)))
+    render = pictures.FrameRender(camera_of(pose_of(maker.source.record.train_cameras[0]), 8))
+    frame = maker.advance(render, change, render.num_rays, 1.0)
+    assert isinstance(frame, MaterialView)
+    for layer in set(maker.layers) - {"error", "index"}:
+        assert maker.paint(frame, LayerSettings(layer=layer), False, False).picture.shape == (8, 12, 3)
+    aids = maker.aids.for_layers(maker.edited(change))
+    assert aids.reference_spectra(frame.materials).isfinite().all()
+    assert_close(aids.reference.abundances[:, 1].max() > 0, torch.tensor(not isinstance(edit, Remove)))

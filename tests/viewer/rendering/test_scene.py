@@ -73,7 +73,7 @@ def test_pictures_are_looked_at_only_for_edits_that_depend_on_them(trained):
 def test_what_cameras_see_is_sampled_again_only_where_parts_go(trained, source, monkeypatch):
     sampled = []
     monkeypatch.setattr(aids_module, "sample_seen", lambda scene: sampled.append(1) or sample_seen(scene))
-    aids = SceneAids(replace(source, take=lambda: trained), has_materials=True)
+    aids = SceneAids(replace(source, take=lambda: trained))
     for removed, times in (((), 1), ((1,), 2), ((1, 2), 3)):
         for colour in ((0.5, 0.4, 0.3), (0.3, 0.4, 0.5)):
             before = (Remove(removed),) if removed else ()
@@ -241,12 +241,12 @@ def test_a_click_takes_one_device_turn_and_is_measured_in_it(views, scene, ball_
 
 def test_an_error_is_shown_though_the_scene_was_read_late(views, scene, ball_of, source, monkeypatch):
     camera, render = scene.cameras[scene.train_indices[1]], aids_module.render_reference
-    aids = SceneAids(replace(source, take=lambda: ball_of(camera).scene), has_materials=True)
+    aids = SceneAids(replace(source, take=lambda: ball_of(camera).scene))
 
     def slowly(*arguments):
         aids.measured = views
         return render(*arguments)
 
     monkeypatch.setattr(aids_module, "render_reference", slowly)
-    found: Any = aids.for_layers()
+    found: Any = aids.for_layers(ball_of(camera).scene)
     assert found.measured is views

@@ -32,7 +32,7 @@ from unmix_plugin.captures.writing.view_files import FULL_SCALE, BackgroundRule,
 from unmix_plugin.engine.runs.atomic_files import write_file
 from unmix_plugin.errors import counted, name_some
 from unmix_plugin.figures.pictures import Canvas, CanvasLayout, columns_for
-from unmix_plugin.figures.plotting import FIGURE_DPI, figure_bytes, plain_axes
+from unmix_plugin.figures.plotting import FIGURE_DPI, figure_bytes, plain_axes, plot_text
 from unmix_plugin.formats.meshes import write_ply
 from unmix_plugin.scenes.backdrops import Backdrop
 from unmix_plugin.spectral.bands import Bands
@@ -294,7 +294,14 @@ def _contact_sheet(
     top = 0.27 + 0.18 * len(lines)
     page = (page_width, top + height + _CHARTS_INCHES + 0.55)
     figure = Figure(figsize=page, facecolor="white")
-    figure.text(0.2 / page[0], 1 - 0.15 / page[1], "\n".join(lines), fontsize=11, fontweight="bold", va="top")
+    figure.text(
+        0.2 / page[0],
+        1 - 0.15 / page[1],
+        plot_text("\n".join(lines)),
+        fontsize=11,
+        fontweight="bold",
+        va="top",
+    )
     axes = figure.add_axes((0.2 / page[0], 1 - (top + height) / page[1], width / page[0], height / page[1]))
     axes.imshow(tiles, interpolation="none")
     axes.set_axis_off()
@@ -363,7 +370,7 @@ def _draw_cameras(
     axes.set_xlim(-reach, reach)
     axes.set_ylim(-reach, reach)
     axes.set_aspect("equal")
-    axes.set_title(title, fontsize=9)
+    axes.set_title(plot_text(title), fontsize=9)
     axes.set_xlabel("xyz"[across], fontsize=8)
     axes.set_ylabel("xyz"[up], fontsize=8, labelpad=0)
     axes.tick_params(labelsize=7)
@@ -380,7 +387,7 @@ def _draw_spectra(axes: Any, views: Sequence[SeenView], sensors: Mapping[str, Se
         means = np.array([view.record.mean_spectrum for view in views if view.record.sensor == name])
         style = {"color": colour, "marker": "." if len(nm) < 12 else None}
         axes.plot(nm, means.T, alpha=0.15, linewidth=0.6, **style)
-        label = f"{name}: mean" if name else "mean over views"
+        label = plot_text(f"{name}: mean") if name else "mean over views"
         axes.plot(nm, means.mean(axis=0), linewidth=1.8, label=label, **style)
         dropped += sensor.bands.wavelengths_nm[sorted(sensor.bands.dropped)].tolist()
     if dropped:

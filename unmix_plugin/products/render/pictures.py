@@ -25,7 +25,14 @@ from unmix_plugin.figures.pictures import (
     paint,
     premultiplied_over_neutral,
 )
-from unmix_plugin.figures.plotting import Colour, draw_colour_bar, figure_bytes, id_colours, page_in_inches
+from unmix_plugin.figures.plotting import (
+    Colour,
+    draw_colour_bar,
+    figure_bytes,
+    id_colours,
+    page_in_inches,
+    plot_text,
+)
 from unmix_plugin.formats.files import csv_bytes, eight_bits
 from unmix_plugin.spectral.colour.srgb import decode_srgb, encode_srgb
 from unmix_plugin.spectral.materials import Materials
@@ -178,6 +185,6 @@ def draw_legend(output: Output, palette: Palette) -> bytes:
         box = (_MARGIN, _MARGIN + names_height + 0.3, width, 0.14)
         drawn = draw_colour_bar(page, box, scale.colour_map, (scale.low, scale.high), "horizontal")
         drawn.ax.tick_params(labelsize=_FONT_PT - 1, length=2, pad=2)
-        drawn.ax.set_title(f"{output.name}: {scale.label}", fontsize=_FONT_PT, loc="left", pad=3)
+        drawn.ax.set_title(plot_text(f"{output.name}: {scale.label}"), fontsize=_FONT_PT, loc="left", pad=3)
     draw_legend_entries(page, names, (_MARGIN, _MARGIN + names_height), width)
     return figure_bytes(figure)

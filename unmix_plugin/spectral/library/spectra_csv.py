@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from unmix_plugin.engine.runs.atomic_files import write_file
+from unmix_plugin.engine.tables import csv_bytes
 from unmix_plugin.errors import SpectrumError, name_some
 from unmix_plugin.limits import read_bounded
 from unmix_plugin.spectral.bands import Bands, require_nanometres
@@ -142,12 +143,9 @@ def read_number_table(path: Path) -> tuple[list[str], Float64[np.ndarray, "R C"]
 
 def write_spectra_csv(path: Path, table: SpectraTable) -> None:
     """Write a table with 9 significant digits, exact for float32; an older file is replaced in one step."""
-    text = io.StringIO(newline="")
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["wavelength", *table.names])
-    for wavelength_nm, values in zip(table.bands.centers_nm, table.spectra.T, strict=True):
-        writer.writerow([f"{value:.9g}" for value in (wavelength_nm, *values)])
-    write_file(path, text.getvalue().encode())
+    values = np.column_stack([table.bands.centers_nm, table.spectra.T])
+    rows = ([f"{value:.9g}" for value in row] for row in values)
+    write_file(path, csv_bytes([["wavelength", *table.names], *rows]))
 
 
 def _parse_row(row: list[str], line: int, header: list[str]) -> list[float]:

@@ -308,8 +308,8 @@ class ScenePanel:
     def _add_points(self) -> list[viser.PointCloudHandle]:
         """Surface points of the materials that are visible, in the colours that these have now; every n-th where there
         are too many."""
-        aids, materials = self._session.services.maker.aids.for_layers(), self._session.materials()
-        assert aids is not None
+        shown = self._session.services.maker.edited(self._session.view.edit)
+        aids, materials = self._session.services.maker.aids.for_layers(shown), shown.materials
         recipe = self._session.history.present
         are_shown = np.array([is_shown(recipe, index) for index in range(len(materials.names))])
         main = aids.reference.abundances.argmax(dim=-1).cpu().numpy()

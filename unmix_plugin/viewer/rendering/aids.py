@@ -5,16 +5,13 @@ Notation: `N` reference rays that end on something, `B` bands, `K` endmembers.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from unmix_plugin.editing import sample_seen
-from unmix_plugin.editing.edited_field import EditedField
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.spectral.materials import Coefficients, Materials
@@ -46,6 +43,8 @@ def render_reference(scene: TrainedScene, cameras: Cameras) -> tuple[Coefficient
 
 
 _MOST_REMEMBERED = 32
+_EDITS_KEPT = 4
+"""Edits of shapes or gloss whose reference rays are kept."""
 
 
 @dataclass(frozen=True)
@@ -53,14 +52,15 @@ class LayerAids:
     """What layers need to know of the run."""
 
     reference: Coefficients
-    """Of some rays through the whole scene that stay the same while the camera moves: colour scales and principal axes
-    are taken from them, so that colours mean the same from everywhere. (N, ...)."""
+    """Of some rays through the whole scene, as it is edited, that stay the same while the camera moves: colour scales
+    and principal axes are taken from them, so that colours mean the same from everywhere. (N, ...)."""
     reference_points: Float[Tensor, "N 3"]
     """Where the rays end, model space."""
     scene_box: SceneBox
     measured: MeasuredViews | str = "the scene is not at hand"
     """What the training views measured, or why that is unknown."""
     _kept: Renewed = field(default_factory=lambda: Renewed(_MOST_REMEMBERED), repr=False, compare=False)
+    """Colours and principal components, by the materials that clients look at."""
 
     def reference_spectra(self, materials: Materials) -> Float[Tensor, "N B"]:
         """What the rays show with the given materials, as if each ended fully on what it ended on."""
@@ -68,11 +68,17 @@ class LayerAids:
 
     def colours_of(self, materials: Materials) -> Float[Tensor, "K 3"]:
         """sRGB colours that stand for the materials, as in all pictures of a run."""
-        return self._remembered("colours", materials, _colours)
+        return self._kept.get(
+            ("colours", _bytes_of(materials)),
+            0,
+            lambda: torch.as_tensor(endmember_colours(materials)).to(materials.endmembers),
+        )
 
     def pca_of(self, materials: Materials) -> PcaColours:
         """Principal components of what the reference rays show with the materials."""
-        return self._remembered("pca", materials, lambda shown: PcaColours.fit(self.reference_spectra(shown)))
+        return self._kept.get(
+            ("pca", _bytes_of(materials)), 0, lambda: PcaColours.fit(self.reference_spectra(materials))
+        )
 
     def depth_range(self, frame: MaterialView) -> tuple[float, float]:
         """Distances between which the scene box lies, world units."""
@@ -81,42 +87,34 @@ class LayerAids:
         distance = float((frame.camera.camera_to_world[0, :, 3].cpu() - middle).norm())
         return (max(0.0, distance - radius) / scale, (distance + radius) / scale)
 
-    def _remembered(self, what: str, materials: Materials, make: Callable[[Materials], Any]) -> Any:
-        """What `make` gives, kept for the materials that clients look at."""
-        spectra = torch.cat([materials.endmembers, materials.specular_spectra])
-        key = (what, spectra.cpu().numpy().tobytes())
-        return self._kept.get(key, 0, lambda: make(materials))
 
-
-def _colours(materials: Materials) -> Float[Tensor, "K 3"]:
-    return torch.as_tensor(endmember_colours(materials)).to(materials.endmembers)
+def _bytes_of(materials: Materials) -> bytes:
+    return torch.cat([materials.endmembers, materials.specular_spectra]).cpu().numpy().tobytes()
 
 
 class SceneAids:
     """What layers and edits need of the scene beside the view itself: made again as training goes on."""
 
-    def __init__(self, source: SceneSource, has_materials: bool) -> None:
+    def __init__(self, source: SceneSource) -> None:
         self.measured: MeasuredViews | str = "the scene is still being read"
         """What the training views measured, or why that is unknown: noted by another thread at any moment."""
-        self._source, self._has_materials = source, has_materials
-        self._for_layers, self._seen = Renewed(1), Renewed(2)
+        self._source = source
+        self._for_layers, self._seen = Renewed(_EDITS_KEPT), Renewed(2)
 
-    def for_layers(self) -> LayerAids | None:
-        """What layers need; None without materials. Must not be called while the scene is lent."""
-        if not self._has_materials:
-            return None
+    def for_layers(self, scene: TrainedScene) -> LayerAids:
+        """What layers of a scene, unedited or edited, need. Must not be called while the scene is lent."""
         record, is_training = self._source.record, self._source.device.is_training
 
         def make() -> LayerAids:
-            with self._source.borrowed_materials() as scene:
+            with self._source.borrowed():
                 return LayerAids(*render_reference(scene, record.train_cameras), record.scene_box)
 
         # What a training has ended with is looked at for long.
-        aids = self._for_layers.get(None, self._source.version, make, STEPS_KEPT if is_training else 1)
+        steps = STEPS_KEPT if is_training else 1
+        aids = self._for_layers.get(scene.visibility, self._source.version, make, steps)
         return replace(aids, measured=self.measured)
 
     def see(self, scene: TrainedScene) -> Coefficients:
         """What the training cameras see of the scene, or of what edits leave of it, not long ago; called while it is
         lent."""
-        change = scene.field.change if isinstance(scene.field, EditedField) else None
-        return self._seen.get(change, self._source.version, lambda: sample_seen(scene))
+        return self._seen.get(scene.visibility, self._source.version, lambda: sample_seen(scene))

@@ -19,7 +19,6 @@ import torch
 from jaxtyping import Float32, UInt8
 from torch import Tensor
 
-from unmix_plugin.editing.edited_field import EditedField
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.spectral.materials import Coefficients, Materials
 from unmix_plugin.trained.model_scene import EstimatedScene, ModelView
@@ -245,7 +244,7 @@ class PictureMaker:
             self.layers = layers_of(scene)
             """What can be shown, by name."""
             is_mixed = isinstance(scene, TrainedScene)
-            self.aids = SceneAids(source, is_mixed)
+            self.aids = SceneAids(source)
             numbers = _num_channels(scene.materials) if is_mixed else 4 * len(scene.outputs)
         self._largest_pixels = max(256, LARGEST_FRAME_BYTES // (4 * numbers))
 
@@ -309,10 +308,10 @@ class PictureMaker:
 
     def paint(self, frame: RenderedView, settings: LayerSettings, with_depth: bool, is_moving: bool) -> Shown:
         """A frame as a picture; an UnmixError if the layer can't be shown."""
-        layer, aids = layer_named(settings.layer, self.layers), self.aids.for_layers()
+        layer = layer_named(settings.layer, self.layers)
+        aids = self.aids.for_layers(frame.scene) if isinstance(frame, MaterialView) else None
         with torch.no_grad():
-            field = frame.scene.field if isinstance(frame, MaterialView) else None
-            if isinstance(frame, MaterialView) and isinstance(field, EditedField) and field.removes:
+            if isinstance(frame, MaterialView) and frame.scene.has_removed:
                 # Removed materials leave faint specks where they were mixed with others.
                 is_left = (frame.opacity >= _TRACE_OPACITY)[..., None]
                 frame = frame.map(lambda packed: packed * is_left)
