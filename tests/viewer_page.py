@@ -43,6 +43,8 @@ class Page:
     notices: list[tuple[str, str]] = field(default_factory=list)
     """Titles and texts."""
     downloads: list[str] = field(default_factory=list)
+    frusta: dict[str, bool] = field(default_factory=dict)
+    """Whether each camera that is shown has its image."""
     is_closed: bool = False
     storage: dict[str, str] = field(default_factory=dict)
     """What the browser keeps from page to page."""
@@ -151,6 +153,8 @@ class Page:
             self.controls[message["uuid"]] = {"type": kind, **message["props"], **value}
         elif kind == "NotificationShowMessage":
             self.notices.append((message["props"]["title"], message["props"]["body"]))
+        elif kind in ("CameraFrustumMessage", "SceneNodeUpdateMessage"):
+            self._take_node(message)
         elif kind == "FileTransferStartDownload":
             self.downloads.append(message["filename"])
         elif kind == "LocalStorageSetItemMessage":
@@ -158,6 +162,12 @@ class Page:
         elif kind == "LocalStorageGetItemRequestMessage":
             answer = {"value": self.storage.get(message["key"]), "request_uuid": message["request_uuid"]}
             self.send("LocalStorageGetItemResponseMessage", error=None, **answer)
+
+    def _take_node(self, message: dict[str, Any]) -> None:
+        if message["type"] == "CameraFrustumMessage":
+            self.frusta[message["name"]] = message["props"]["_image_data"] is not None
+        elif message["updates"].get("_image_data") is not None:
+            self.frusta[message["name"]] = True
 
 
 def _looking_at_origin(place: tuple[float, float, float]) -> tuple[float, float, float, float]:

@@ -2,6 +2,7 @@
 
 import json
 import signal
+import time
 from contextlib import contextmanager
 
 import pytest
@@ -94,14 +95,18 @@ def test_a_run_whose_scene_has_gone_is_shown_without_what_was_measured(run_copy)
     assert contents(run_copy) == before
 
 
+def add_key_frames(page, *angles):
+    for number, angle in enumerate(angles, start=1):
+        page.look_from(angle)
+        page.set("add a key frame here", True)
+        key = page.controls[page.control("key frame")]
+        page.wait_until(lambda key=key, number=number: key.get("value") == f"{number} of {number}")
+
+
 def test_a_path_becomes_a_video_of_the_edited_scene(run_copy):
     with served(run_copy) as (_, page):
         wait_for_control(page, "render a video")
-        for number, angle in enumerate((0.3, 0.6), start=1):
-            page.look_from(angle)
-            page.set("add a key frame here", True)
-            key = page.controls[page.control("key frame")]
-            page.wait_until(lambda key=key, number=number: key.get("value") == f"{number} of {number}")
+        add_key_frames(page, 0.3, 0.6)
         page.set("light", "A")
         for label, value in (("width", 33), ("height", 32), ("seconds", 0.5), ("frames a second", 6)):
             page.set(label, value)
@@ -124,3 +129,28 @@ def test_a_run_is_shown_with_the_edits_and_the_light_asked_for(run_copy):
         assert "clay" in page.controls[page.control("other endmember")]["options"]
         page.set("changes", "start again")
         page.wait_until(lambda: page.controls[page.control("light")]["value"] == "as recorded")
+
+
+def test_a_video_goes_on_when_its_page_is_closed(run_copy):
+    folder = run_copy / "exports" / "viewer"
+    viewer = prepared(ViewOptions(run=run_copy, device="cpu", viewer=ViewerOptions(port=0)))
+    viewer.start()
+    try:
+        with looking(f"ws://127.0.0.1:{viewer.port}") as page:
+            wait_for_control(page, "render a video")
+            add_key_frames(page, 0.3, 0.6)
+            for label, value in (("width", 64), ("height", 64), ("seconds", 1.0), ("frames a second", 12)):
+                page.set(label, value)
+            page.set("render a video", True)
+            page.wait_until(lambda: any(title == "video" for title, _ in page.notices))
+        until = time.monotonic() + START_S
+        while not list(folder.rglob("*.mp4")):
+            assert time.monotonic() < until, list(folder.rglob("*"))
+            time.sleep(0.1)
+        assert not list(folder.rglob(".*"))
+        with looking(f"ws://127.0.0.1:{viewer.port}") as page:
+            wait_for_control(page, "render a video")
+    finally:
+        viewer.stop()
+    (video,) = folder.rglob("*.mp4")
+    assert read_video(video)[0].shape == (12, 64, 64, 3)

@@ -12,6 +12,7 @@ from tests.editing.scenes import CAMERAS, LIGHT, edited, lit_scene
 from unmix_plugin.editing import sample_seen
 from unmix_plugin.editing.edited_field import Appearance, EditedField, MaterialState, appearance_of
 from unmix_plugin.field import CoefficientField
+from unmix_plugin.figures.plotting import css_colour
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.materials import Coefficients
 from unmix_plugin.trained.run_views import RunView
@@ -151,6 +152,11 @@ def test_a_colour_that_pictures_cannot_have_becomes_the_nearest_that_they_can():
     result = edited(lit_scene(), "retint: {endmember: 0, colour: '#ffffff'}", seen=seen)
     [note] = result.notes
     assert "(retint): pictures of endmember_0 can't be #ffffff in this light; took the nearest colour" in note
+    reached = result.reached_colours["retint", 0]
+    assert max(reached) < 0.9
+    assert note.endswith(css_colour(reached))
+    swapped = edited(lit_scene(), "retint: {endmember: 0, colour: '#ffffff'}", "swap: [0, 1]", seen=seen)
+    assert swapped.reached_colours == {("retint", 1): reached}
     brightest = result.materials.endmembers[0].detach().double() / torch.tensor(LIGHT).double()
     all_of_bound = torch.full_like(brightest, 1 / 0.6)
     assert_close(brightest, all_of_bound, rtol=1e-3, atol=0)

@@ -23,6 +23,7 @@ from unmix_plugin.engine.runs.load_run import SceneRecord
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.engine.training.training_control import DeviceShare
 from unmix_plugin.errors import ConfigError
+from unmix_plugin.figures.plotting import css_colour
 from unmix_plugin.formats.files import eight_bits
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import illuminant_names, linear_to_srgb, rgb_matrix
@@ -298,6 +299,45 @@ def test_depth_comes_with_objects_and_goes_with_them(page):
     assert page.notices == []
 
 
+class SlowThumbnails:
+    """Images of views that take as long as a test wants."""
+
+    def __init__(self):
+        self.may_go, self.asked = threading.Event(), []
+
+    def of(self, name):
+        self.asked.append(name)
+        assert self.may_go.wait(60)
+        return np.full((4, 6, 3), 200, np.uint8)
+
+
+def test_a_page_goes_on_while_images_of_its_cameras_are_read(source, monkeypatch):
+    with serving(source) as (viewer, _), opened(viewer) as page:
+        images = SlowThumbnails()
+        monkeypatch.setattr(viewer.services, "thumbnails", images)
+        page.set("cameras")
+        page.wait_until(lambda: len(page.frusta) == len(viewer.services.views))
+        show_layer(page, "depth")  # while the first image is being read
+        assert not any(page.frusta.values())
+        images.may_go.set()
+        page.wait_until(lambda: all(page.frusta.values()))
+        assert images.asked == [view.name for view in viewer.services.views]
+        assert page.notices == []
+
+
+def test_images_are_read_no_further_once_cameras_are_hidden(source, monkeypatch):
+    with serving(source) as (viewer, _), opened(viewer) as page:
+        images = SlowThumbnails()
+        monkeypatch.setattr(viewer.services, "thumbnails", images)
+        page.set("cameras")
+        page.wait_until(lambda: len(images.asked) == 1)
+        page.set("cameras", False)
+        show_layer(page, "depth")
+        images.may_go.set()
+        show_layer(page, "colour")
+        assert len(images.asked) <= 2
+
+
 def test_materials_are_edited_undone_saved_and_loaded(viewer):
     with opened(viewer) as page, opened(viewer) as other:
         before, count = decoded(page.last_picture), len(other.pictures)
@@ -413,6 +453,15 @@ def test_pictures_and_spectra_have_the_size_asked_for_and_lie_in_the_run_folder(
 
 
 @pytest.mark.slow
+def test_the_colour_that_is_shown_is_the_one_that_was_reached(page):
+    page.set("colour", (0, 255, 0))
+    page.wait_for_notice("took the nearest colour")
+    _, said = page.notices[-1]
+    nearest = said[said.index("took the nearest colour, ") :].split()[-1]
+    page.wait_until(lambda: css_colour([value / 255 for value in page.props("colour")["value"]]) == nearest)
+    assert "#00ff00" in page.props("recipe")["value"]
+
+
 def test_a_colour_that_is_refused_again_and_again_is_one_notice(viewer, monkeypatch):
     accept, refused = viewer.services.maker.edited, threading.Semaphore(0)
 

@@ -28,6 +28,7 @@ from unmix_plugin.spectral.maps.indices import parse_formula
 from unmix_plugin.viewer import connections
 from unmix_plugin.viewer.authentication import Authentication
 from unmix_plugin.viewer.connections import _Connection, _is_heard
+from unmix_plugin.viewer.rendering.captures import VideoQueue
 
 SERVE = websockets.asyncio.server.serve
 
@@ -108,6 +109,24 @@ def test_the_last_that_a_page_shows_is_how_training_ended(tmp_path, is_stopped, 
         assert said in page.texts
         assert "s of training" not in page.texts
         assert page.props("pause")["disabled"]
+
+
+def test_a_viewer_that_nobody_watches_stays_until_its_videos_are_rendered(source, monkeypatch):
+    monkeypatch.setattr("unmix_plugin.viewer.server._UNWATCHED_S", 1)
+    is_rendering = threading.Event()
+    is_rendering.set()
+    monkeypatch.setattr(VideoQueue, "is_busy", property(lambda _: is_rendering.is_set()))
+    with serving(source) as (viewer, lines):
+        waiting = threading.Thread(target=viewer.wait, kwargs={"while_watched": True})
+        waiting.start()
+        waiting.join(2.5)
+        assert waiting.is_alive()
+        is_rendering.clear()
+        waiting.join(60)
+        assert not waiting.is_alive()
+        is_rendering.set()
+        viewer.stop()
+        assert lines[-1] == "a video was being rendered and is not kept: the viewer was stopped"
 
 
 NO_CAMERAS: tuple[dict[str, Any], ...] = (

@@ -204,6 +204,8 @@ def _swap(state: MaterialState, edit: Swap, _: str) -> None:
     # What was done to looks goes with the looks.
     places = {(what, one): (what, first + second - one) for what in _OF_LOOKS for one in (first, second)}
     state.done = {places.get(key, key): edit for key, edit in state.done.items()}
+    places = {("retint", one): ("retint", first + second - one) for one in (first, second)}
+    state.reached = {places.get(key, key): colour for key, colour in state.reached.items()}
 
 
 _OF_LOOKS = (_REPLACED, _RETINTED)
@@ -252,7 +254,8 @@ def _retint(state: MaterialState, edit: Retint, where: str) -> None:
     changed = _retinted(state.bands, reflectance, to_rgb, wanted, shown.greatest_reflectance)
     state.spectra[index] = changed * light
     what = state.names[index] if seen is None else f"pictures of {state.names[index]}"
-    _note_nearest(state, f"{where}: {what}", edit.colour, shown.mean_srgb(changed @ to_rgb))
+    reached = _reached_colour(state, f"{where}: {what}", edit.colour, shown.mean_srgb(changed @ to_rgb))
+    state.reached["retint", index] = reached
 
 
 _IN_FULL_LIGHT = Appearance(np.ones(1), np.zeros((1, 3)), np.ones(1))
@@ -263,12 +266,15 @@ def _rgb_matrix(state: MaterialState) -> Float64[np.ndarray, "B 3"]:
     return rgb_matrix(state.bands, torch.float64).numpy()
 
 
-def _note_nearest(state: MaterialState, what: str, asked: Colour, reached: np.ndarray) -> None:
-    """Note if a colour visibly differs from the one asked for."""
-    if np.abs(reached - asked).max() > _VISIBLE_DIFFERENCE:
-        state.notes.append(
-            f"{what} can't be {css_colour(asked)} in this light; took the nearest colour, {css_colour(reached)}"
-        )
+def _reached_colour(state: MaterialState, what: str, asked: Colour, reached: np.ndarray) -> Colour:
+    """The colour asked for, or the one reached if it visibly differs, which is noted."""
+    if np.abs(reached - asked).max() <= _VISIBLE_DIFFERENCE:
+        return asked
+    state.notes.append(
+        f"{what} can't be {css_colour(asked)} in this light; took the nearest colour, {css_colour(reached)}"
+    )
+    red, green, blue = reached.tolist()
+    return red, green, blue
 
 
 def _scale(state: MaterialState, edit: Scale, _: str) -> None:
@@ -309,12 +315,14 @@ def _gloss(state: MaterialState, edit: Gloss, where: str) -> None:
         white, to_rgb = np.ones(len(state.bands)), _rgb_matrix(state)
         mirror = _retinted(state.bands, white, to_rgb, _IN_FULL_LIGHT.full_colour(edit.colour))
         state.mirror_reflectances[edit.colour] = mirror
-        _note_nearest(state, f"{where}: highlights", edit.colour, _IN_FULL_LIGHT.mean_srgb(mirror @ to_rgb))
+        shown = _IN_FULL_LIGHT.mean_srgb(mirror @ to_rgb)
+        state.mirror_colours[edit.colour] = _reached_colour(state, f"{where}: highlights", edit.colour, shown)
     for index in chosen:
         state.gloss[index] *= edit.scale
         if edit.colour is not None:
             state.note(_COLOURED, index, where)
             state.mirrors[index] = edit.colour
+            state.reached["gloss", index] = state.mirror_colours[edit.colour]
 
 
 _HANDLERS: dict[type[Operation], Callable[[MaterialState, Any, str], None]] = {
@@ -372,7 +380,8 @@ def edit_scene(
         )
     assumed = assumption_of_light(scene, recipe)
     notes = [*scene.notes, *([] if assumed is None else [assumed]), *state.notes, *told]
-    return replace(_with_visibility(scene, state), materials=materials, notes=tuple(notes))
+    edited = _with_visibility(scene, state)
+    return replace(edited, materials=materials, notes=tuple(notes), reached_colours=state.reached)
 
 
 def _require_names_that_differ(state: MaterialState, recipe: Recipe) -> None:

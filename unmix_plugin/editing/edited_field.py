@@ -144,6 +144,10 @@ class MaterialState:
     """Which edit did what to which endmember."""
     notes: list[str] = field(default_factory=list)
     """What the user has to be told about the result."""
+    mirror_colours: dict[Colour, Colour] = field(default_factory=dict)
+    """The sRGB colours that mirrors reach, by those asked for."""
+    reached: dict[tuple[str, int], Colour] = field(default_factory=dict)
+    """What colour an endmember got of the one asked for, by kind of edit (`retint`, `gloss`) and number."""
 
     @classmethod
     def of(cls, materials: Materials, light: Float64[np.ndarray, " B"] | None) -> MaterialState:

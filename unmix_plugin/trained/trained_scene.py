@@ -8,8 +8,9 @@ Notation: `H x W` pixels, `B` bands, `K` endmembers.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
+from dataclasses import field as dataclass_field
 from typing import Literal
 
 import numpy as np
@@ -85,6 +86,11 @@ class TrainedScene:
     fit each other where it is equal."""
     has_removed: bool = False
     """Whether edits removed a material."""
+    reached_colours: Mapping[tuple[str, int], tuple[float, float, float]] = dataclass_field(
+        default_factory=dict
+    )
+    """sRGB colours that edits gave, or the nearest that they could: by kind of edit (`retint`, `gloss`) and number of
+    the endmember."""
     fitted: tuple[Literal["pose", "gain"], ...] = ()
     """What training found for each of its views, so that other views are aligned before they are measured."""
     scale: Scale | None = None

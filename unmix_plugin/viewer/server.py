@@ -126,6 +126,8 @@ class Viewer:
             session.close()
         if self._server is not None and sessions:
             send_what_is_queued(self._server)
+        if self.services.videos.is_busy:
+            self._say("a video was being rendered and is not kept: the viewer was stopped")
         self.services.stop()
         if self._server is not None:
             with quiet():
@@ -140,11 +142,13 @@ class Viewer:
 
     def wait(self, while_watched: bool = False) -> None:
         """Serve until Ctrl-C, SIGTERM or SIGHUP, which raise KeyboardInterrupt, or until stopped by another thread;
-        `while_watched` ends once no page has been open for so long that one that is loaded again is back."""
+        `while_watched` ends once no page has been open for so long that one that is loaded again is back, and no video
+        is being rendered."""
         unwatched_s = 0
         with _interrupting_signals():
             while not self._stopped.wait(1.0):
-                unwatched_s = 0 if self._sessions else unwatched_s + 1
+                is_needed = bool(self._sessions) or self.services.videos.is_busy
+                unwatched_s = 0 if is_needed else unwatched_s + 1
                 if while_watched and unwatched_s >= _UNWATCHED_S:
                     return
 

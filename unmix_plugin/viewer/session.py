@@ -34,6 +34,7 @@ from unmix_plugin.viewer.rendering.regions import RunRegions
 from unmix_plugin.viewer.rendering.render_loop import RenderLoop, View
 from unmix_plugin.viewer.rendering.scene import Edit, MeasuredViews, SceneSource, usable_views
 from unmix_plugin.viewer.rendering.settings import LayerSettings, first_settings
+from unmix_plugin.viewer.rendering.thumbnails import Thumbnails
 from unmix_plugin.viewer.view_cameras import ViewPose, camera_of, point_ahead, pose_from, pose_of
 
 if TYPE_CHECKING:
@@ -65,8 +66,8 @@ class Services:
         """
         self.source, self._library = source, library
         self.views = recorded_views(source.record)
-        self.scene: Scene | None = None
-        """The scene, once it is read."""
+        self.thumbnails: Thumbnails | None = None
+        """The views of the scene in few pixels, once the scene is read."""
         self.folder = source.run.exports / "viewer"
         """Where files go that clients ask for: in the run folder, and nowhere else."""
         self.recipes_folder = source.run.path / "recipes"
@@ -142,7 +143,8 @@ class Services:
             aids.measured = f"the scene is not at hand: {reason}"
 
         with failures_said("the scene could not be read", give_up):
-            scene = self.scene = self._read_scene()
+            scene = self._read_scene()
+            self.thumbnails = Thumbnails(scene)
             if self.has_materials and usable_views(scene):
                 aids.measured = MeasuredViews(scene, self.source)
             else:

@@ -226,7 +226,10 @@ class CapturePanel:
         services.videos.start(self._video)
         others = differences(settings, layer_named(settings.layer, services.maker.layers).controls)
         unlike = f"; unlike the page, it has {'; '.join(others)}" if others else ""
-        session.say("video", f"unmix-render writes it to {folder}, after those of other pages{unlike}")
+        place = (
+            f"unmix-render writes it to {folder}, after those of other pages, also when this page is closed"
+        )
+        session.say("video", f"{place}{unlike}")
 
     def _cancel_video(self) -> None:
         if self._video is not None:

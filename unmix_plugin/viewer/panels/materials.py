@@ -273,12 +273,16 @@ class MaterialsPanel:
             index, recipe = self._index, self._recipe
             scale, gloss = recipes.change_of(recipe, Scale, index), recipes.change_of(recipe, Gloss, index)
             retint = recipes.change_of(recipe, Retint, index)
+            reached = self._session.services.maker.edited(self._session.view.edit).reached_colours
             self._is_visible.value = recipes.is_shown(recipe, index)
             self._is_alone.value = index in recipes.named_by(recipe, Isolate)
             self._factor.value = scale.factor if scale else 1.0
             self._gloss.value = gloss.scale if gloss else 1.0
-            self._gloss_colour.value = _bytes(gloss.colour) if gloss and gloss.colour else _WHITE
-            self._colour.value = _bytes(retint.colour if retint else _colour_of(materials, index))
+            # The colours that were reached, which may not be those asked for.
+            gloss_colour = reached.get(("gloss", index)) if gloss and gloss.colour else None
+            self._gloss_colour.value = _bytes(gloss_colour) if gloss_colour else _WHITE
+            colour = reached.get(("retint", index)) if retint else None
+            self._colour.value = _bytes(_colour_of(materials, index) if colour is None else colour)
             # While a name is typed the field is the user's: "blue " may become "blue cloth".
             if not self._typed_name.is_waiting and text(self._name.value).strip() != materials.names[index]:
                 self._name.value = materials.names[index]

@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from jaxtyping import UInt8
 
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.formats.files import eight_bits
-from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.maps.indices import available_indices
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.model_scene import LightChoice
-from unmix_plugin.viewer.page import Debounced, choice, index_in, number, number_of, text
+from unmix_plugin.viewer.page import Debounced, choice, failures_said, index_in, number, number_of, text
 from unmix_plugin.viewer.recipes import is_shown
 from unmix_plugin.viewer.rendering.painting import layer_named
 from unmix_plugin.viewer.rendering.pictures import DEFAULT_HEIGHT, HEIGHT_BOUNDS, SUBPIXEL_BOUNDS
@@ -31,6 +30,7 @@ from unmix_plugin.viewer.rendering.settings import (
     VIEW_TRANSFORMS,
     covered,
 )
+from unmix_plugin.viewer.rendering.thumbnails import Thumbnails
 from unmix_plugin.viewer.session import Session
 from unmix_plugin.viewer.view_cameras import pose_of
 
@@ -211,7 +211,8 @@ _LARGEST_FRUSTUM = 0.12
 _FRUSTUM_SHARE = 0.3
 """Size of a frustum in the distance to its nearest neighbour, so that frusta do not cover each other."""
 _TRAIN_COLOUR, _EVAL_COLOUR = (40, 120, 200), (220, 120, 30)
-_THUMBNAIL_HEIGHT = 96
+_READ_S = 10.0
+"""How long the image that is being read is waited for when a page closes."""
 _POINT_SIZE = 0.012
 _MOST_POINTS = 20_000
 
@@ -222,6 +223,9 @@ class ScenePanel:
     def __init__(self, session: Session) -> None:
         self._session = session
         self._objects: dict[str, list[Any]] = {}
+        self._reader: threading.Thread | None = None
+        """Reads images of cameras."""
+        session.on_close.append(self._wait_for_reader)
         gui, services = session.client.gui, session.services
         self._views = {view.name: view.camera for view in services.views}
         with gui.add_folder("camera"):
@@ -245,6 +249,11 @@ class ScenePanel:
             if services.has_materials:
                 self._add_switch("point cloud", self._add_points)
                 session.on_edit.append(self._renew_points)
+
+    def _wait_for_reader(self) -> None:
+        # A thread in native code when the interpreter ends takes the process down with it.
+        if self._reader is not None:
+            self._reader.join(_READ_S)
 
     def _renew_points(self) -> None:
         """Materials may have other colours, or be hidden."""
@@ -274,14 +283,14 @@ class ScenePanel:
         self._session.services.loop.change(self._session.view, largest_height=height, subpixels=subpixels)
 
     def _add_cameras(self) -> list[viser.CameraFrustumHandle]:
-        """A frustum for each view, with its image where there is one; a click looks from there."""
+        """A frustum for each view, which gets its image as soon as that is read; a click looks from there."""
         services, cameras = self._session.services, list(self._views.values())
         size, places = _LARGEST_FRUSTUM, torch.cat([one.camera_to_world[:, :, 3] for one in cameras]).cpu()
         if len(places) > 1:
             nearest = torch.cdist(places, places).fill_diagonal_(torch.inf).min(dim=1).values
             size = min(size, max(_FRUSTUM_SHARE * float(nearest.median()), 1e-3))
         handles = []
-        for index, (name, camera) in enumerate(self._views.items()):
+        for index, camera in enumerate(cameras):
             pose, is_train = pose_of(camera), index < len(services.source.record.train_cameras)
             handle = self._session.client.scene.add_camera_frustum(
                 f"/cameras/{index:04d}",
@@ -289,13 +298,35 @@ class ScenePanel:
                 aspect=pose.aspect,
                 scale=size,
                 color=_TRAIN_COLOUR if is_train else _EVAL_COLOUR,
-                image=None if services.scene is None else _thumbnail(services.scene, name),
                 wxyz=pose.wxyz,
                 position=pose.position,
             )
             handle.on_click(self._session.guarded(lambda camera=camera: self._session.look_from(camera)))
             handles.append(handle)
+        if services.thumbnails is not None:
+            self._reader = threading.Thread(
+                target=self._read_images,
+                args=(services.thumbnails, handles),
+                name="unmix-viewer-images",
+                daemon=True,
+            )
+            self._reader.start()
         return handles
+
+    def _read_images(self, thumbnails: Thumbnails, frusta: list[viser.CameraFrustumHandle]) -> None:
+        """Give frusta their images one by one, while pages go on, until the frusta are removed."""
+        session = self._session
+        with failures_said("images of the views could not be read", session.warn):
+            for name, frustum in zip(self._views, frusta, strict=True):
+                image = thumbnails.of(name)
+
+                def show(frustum: viser.CameraFrustumHandle = frustum, image: Any = image) -> None:
+                    if self._objects.get("cameras") is frusta:
+                        frustum.image = image
+
+                session.guarded(show)()
+                if session.is_closed or self._objects.get("cameras") is not frusta:
+                    return
 
     def _add_box(self) -> list[viser.LineSegmentsHandle]:
         low, high = self._session.services.source.record.scene_box.aabb.cpu().numpy()
@@ -322,21 +353,3 @@ class ScenePanel:
         if len(points) == 0:
             return []
         return [scene.add_point_cloud("/points", points[::step], colours[::step], point_size=_POINT_SIZE)]
-
-
-def _thumbnail(scene: Scene, name: str) -> UInt8[np.ndarray, "H W 3"] | None:
-    """A view as measured, in few pixels; None for a name that the scene does not have."""
-    index = next((index for index, frame in enumerate(scene.frames) if frame.name == name), None)
-    if index is None:
-        return None
-    picture = scene.srgb(index)
-    step = max(1, scene.cameras[index].height // _THUMBNAIL_HEIGHT)
-    if picture is None:
-        sensor, spectra = scene.sensor_of(index), torch.from_numpy(scene.cube(index)[::step, ::step].copy())
-        weights = torch.from_numpy(sensor.false_colours)
-        if sensor.sees_all_bands:
-            weights = rgb_matrix(Bands.of(scene.wavelengths_nm))
-        small = linear_to_srgb((spectra @ weights.to(spectra)).clamp(0, 1)).numpy()
-    else:
-        small = picture[::step, ::step]
-    return np.ascontiguousarray((small * 255 + 0.5).astype(np.uint8))

@@ -112,6 +112,11 @@ class VideoQueue:
         self._jobs: dict[VideoJob, threading.Thread] = {}
         self._is_stopping = False
 
+    @property
+    def is_busy(self) -> bool:
+        """Whether a video is being rendered, or waits for that."""
+        return bool(self._jobs)
+
     def start(self, job: VideoJob) -> None:
         """Render a video when those before it are done."""
         thread = threading.Thread(target=self._run, args=(job,), name="unmix-viewer-video", daemon=True)
