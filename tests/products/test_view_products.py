@@ -26,9 +26,10 @@ from unmix_plugin.products.endmembers import _endmember_paths, _write_endmembers
 from unmix_plugin.products.poses import _poses_json
 from unmix_plugin.products.product import Job, Product
 from unmix_plugin.products.scene_products import Abundances, Cubes, Segmentation
-from unmix_plugin.products.spectrum import _facts, _ProbedPlace, _read_pixel
+from unmix_plugin.products.spectrum import _facts, _ProbedPlace
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.trained.camera_files import read_camera_file
+from unmix_plugin.trained.places import MeasuredScene, SeenPixel
 from unmix_plugin.trained.run_views import RunView
 
 SCENE = make_scene()
@@ -103,16 +104,17 @@ def test_cubes_say_of_which_view_their_numbers_are(tmp_path, product, said):
 
 def test_what_a_training_view_measured_is_as_exposed_as_the_trained_scene(tmp_path):
     scene = load_scene(scene_factory.make_scene(tmp_path / "ball").root)
-    gains, said = torch.rand(len(scene.train_indices), len(scene.wavelengths_nm)) + 0.5, []
-    job = job_of(replace(make_scene(), view_gains=gains), tmp_path, said.append)
+    gains = torch.rand(len(scene.train_indices), len(scene.wavelengths_nm)) + 0.5
+    trained, measured = replace(make_scene(), view_gains=gains), MeasuredScene(scene, None)
     row, column = np.argwhere(scene.cube(0).sum(axis=-1) > 0)[0].tolist()
     for number, index in enumerate(scene.train_indices):
         expected = scene.cube(index)[row, column] / gains[number].numpy()
-        np.testing.assert_allclose(_read_pixel(job, scene, index, column, row), expected, rtol=1e-5)
-    assert said == []
+        np.testing.assert_allclose(
+            measured.spectrum(SeenPixel(index, column, row), trained), expected, rtol=1e-5
+        )
     index = scene.eval_indices[0]
-    assert _read_pixel(job, scene, index, column, row).tolist() == scene.cube(index)[row, column].tolist()
-    assert f"no exposure was fitted to {scene.frames[index].name}" in said[0]
+    as_exposed = measured.spectrum(SeenPixel(index, column, row), trained)
+    assert as_exposed.tolist() == scene.cube(index)[row, column].tolist()
 
 
 def test_poses_are_in_world_space_of_frame_cameras_as_a_camera_file_and_of_line_cameras_by_row(tmp_path):

@@ -147,8 +147,10 @@ def test_the_point_cloud_follows_the_light_and_shows_no_hidden_material(viewer, 
     page.set("visible", False)
     page.wait_until(lambda: len(clouds) == 3)
     assert 0 < len(clouds[-1][0]) < len(points)
-    put(page, {"point cloud": False, "visible": True})
+    page.set("point cloud", False)
     show_layer(page, "depth")
+    page.set("visible")
+    show_layer(page, "segmentation")
     assert len(clouds) == 3
 
 

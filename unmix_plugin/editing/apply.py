@@ -180,7 +180,8 @@ def with_sensor(scene: TrainedScene, sensor: Sensor) -> TrainedScene:
         light=None if materials.light is None else _through(materials.light, seen.matrix),
         sensor=sensor.name,
     )
-    return replace(scene, materials=through, notes=(*scene.notes, seen.description, *seen.notes))
+    notes = (*scene.notes, seen.description, *seen.notes)
+    return replace(scene, materials=through, notes=notes, unedited=scene.as_trained)
 
 
 def _through(spectra: Float[Tensor, "*n B"], matrix: Float64[np.ndarray, "B S"]) -> Float[Tensor, "*n S"]:
@@ -381,7 +382,13 @@ def edit_scene(
     assumed = assumption_of_light(scene, recipe)
     notes = [*scene.notes, *([] if assumed is None else [assumed]), *state.notes, *told]
     edited = _with_visibility(scene, state)
-    return replace(edited, materials=materials, notes=tuple(notes), reached_colours=state.reached)
+    return replace(
+        edited,
+        materials=materials,
+        notes=tuple(notes),
+        reached_colours=state.reached,
+        unedited=scene.as_trained,
+    )
 
 
 def _require_names_that_differ(state: MaterialState, recipe: Recipe) -> None:

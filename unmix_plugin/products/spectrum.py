@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 
 from unmix_plugin.editing.recipe_files import read_recipe
 from unmix_plugin.errors import ConfigError
@@ -26,28 +25,31 @@ from unmix_plugin.formats.libraries import library_of
 from unmix_plugin.products.product import Job
 from unmix_plugin.products.regions import measured_surface
 from unmix_plugin.products.scene_products import Spectrum
-from unmix_plugin.scenes.geometry.views import look_up
-from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Materials
 from unmix_plugin.trained.measures import describe_scale
+from unmix_plugin.trained.places import (
+    MeasuredScene,
+    MeasuredSpectra,
+    NamedRegion,
+    Pixel,
+    PlaceSpectrum,
+    Point,
+    SeenPixel,
+    spectrum_at,
+)
 from unmix_plugin.trained.protocol import Probe
 from unmix_plugin.trained.run_materials import (
     LIGHT_UNKNOWN,
     ShownMatch,
     endmember_colours,
     match_json,
-    relit,
     shown_matches,
 )
 from unmix_plugin.trained.run_views import RunView, find_view
 from unmix_plugin.trained.trained_scene import TrainedScene
 
 _MOST_BARS = 12
-_SAME_PLACE_PX = 2.0
-"""How far from a place a view may end, in its pixels, so that it is taken to see it."""
-_WHOLE = 0.95
-"""Alpha from which a pixel shows one thing."""
 
 
 def export(job: Job, asked: Spectrum) -> list[Path]:
@@ -88,10 +90,9 @@ def _asked_place(job: Job, asked: Spectrum) -> _ProbedPlace:
         point = _numbers(str(asked.point))
         name = f"point_{'_'.join(f'{value:g}' for value in point)}"
         job.claim(_spectrum_paths(job.folder, name))
-        probe = job.scene.probe_point(*point)
+        found = _spectrum_at(job, Point(*point), _measured_scene(job, asked))
         title = f"point {', '.join(f'{value:g}' for value in point)}"
-        over_views = _over_views(job, job.measured_scene(asked.data), probe)
-        return _ProbedPlace(name, title, {"point": list(point)}, probe, over_views=over_views)
+        return _ProbedPlace(name, title, {"point": list(point)}, found.probe, over_views=found.measured)
     if given != (True, True, False, False):
         raise ConfigError(
             "give a pixel with --view and --pixel, a point with --point, or a region with --region alone"
@@ -103,87 +104,55 @@ def _asked_place(job: Job, asked: Spectrum) -> _ProbedPlace:
     view = find_view(job.views("eval"), str(asked.view), job.views("train"))
     name = f"{view.name}_x{column}_y{row}"
     job.claim(_spectrum_paths(job.folder, name))
-    probe = job.scene.probe(view.camera, column, row)
+    measured = _measured_scene(job, asked)
+    found = _spectrum_at(job, Pixel(view.camera, column, row), measured)
     title, facts = f"{view.name}, column {column}, row {row}", {"view": view.name, "pixel": [column, row]}
+    own = _of_pixel(job, measured, view, column, row)
+    return _ProbedPlace(name, title, facts, found.probe, own, over_views=found.measured)
+
+
+def _measured_scene(job: Job, asked: Spectrum) -> MeasuredScene | None:
     scene = job.measured_scene(asked.data)
-    measured = _measured(job, scene, view, (column, row))
-    return _ProbedPlace(name, title, facts, probe, measured, over_views=_over_views(job, scene, probe))
+    return None if scene is None else MeasuredScene(scene, job.loaded.record.summary.get("illuminant"))
+
+
+def _spectrum_at(job: Job, place: Pixel | Point, measured: MeasuredScene | None) -> PlaceSpectrum:
+    with job.working("looking at the place"):
+        found = spectrum_at(job.scene, place, measured)
+    if measured is not None and (found.measured is None or len(found.measured.views) < 2):
+        job.say("fewer than two training views see the place: no spread over views")
+    return found
 
 
 def _region(job: Job, region: str) -> _ProbedPlace:
     name, kept = safe_name(f"region_{region}", NOT_PORTABLE), job.loaded.measures.region(region)
     job.claim([*_spectrum_paths(job.folder, name), *envi_library_paths(job.folder / name)])
-    found = measured_surface(job).measure(kept, region)
-    job.say(f"{region}: {found.said(job.materials.names, job.scene.scale)}")
-    probe = Probe({"predicted": found.mean, "abundances": found.abundances}, 1.0, None, None)
-    facts = {"region": region, "area_square_units": found.area}
-    return _ProbedPlace(name, f"region {region}", facts, probe, spread=found.spread)
+    found = spectrum_at(job.scene, NamedRegion(region, kept, measured_surface(job)))
+    assert found.region is not None
+    job.say(f"{region}: {found.region.said(job.materials.names, job.scene.scale)}")
+    facts = {"region": region, "area_square_units": found.region.area}
+    return _ProbedPlace(name, f"region {region}", facts, found.probe, spread=found.region.spread)
 
 
-def _measured(
-    job: Job, scene: Scene | None, view: RunView, pixel: tuple[int, int]
-) -> Float[np.ndarray, " B"] | None:
-    """What the scene has in a pixel, in the light asked for."""
-    if scene is None:
+def _of_pixel(
+    job: Job, measured: MeasuredScene | None, view: RunView, column: int, row: int
+) -> Float64[np.ndarray, " B"] | None:
+    """What the view itself measured in a pixel, in the light asked for; None, which is said, where it did not."""
+    if measured is None:
         return None
-    index = _with_all_bands(scene).get(view.name)
-    if index is None:
-        why = "was taken by a sensor without all bands"
-    elif not _counts(scene, index, *pixel):
-        why = "has no valid value in that pixel, or its mask leaves it out"
-    else:
-        return _read_pixel(job, scene, index, *pixel)
-    job.say(f"{view.name} {why}: no measured spectrum")
-    return None
-
-
-def _counts(scene: Scene, index: int, column: int, row: int) -> bool:
-    return bool(scene.valid_mask(index, (slice(row, row + 1), slice(column, column + 1))).all())
-
-
-def _read_pixel(job: Job, scene: Scene, index: int, column: int, row: int) -> Float[np.ndarray, " B"]:
-    """What a view has in a pixel, in the light asked for; of a training view, as exposed as the trained scene."""
-    spectrum = scene.cube(index, (slice(row, row + 1), slice(column, column + 1)))[0, 0]
-    gains = job.scene.view_gains
-    if gains is not None and index in scene.train_indices:
-        spectrum = spectrum / gains[scene.train_indices.index(index)].numpy()
-    elif gains is not None:
-        name = scene.frames[index].name
-        job.say(f"no exposure was fitted to {name}: what it measured is as it was exposed")
-    return relit(spectrum, job.loaded.record.summary.get("illuminant"), job.scene.light_power)
-
-
-def _with_all_bands(scene: Scene) -> dict[str, int]:
-    """Views that sensors of all bands took: their numbers by name."""
-    frames = enumerate(scene.frames)
-    return {frame.name: index for index, frame in frames if scene.sensor_of(index).sees_all_bands}
-
-
-def _over_views(job: Job, scene: Scene | None, probe: Probe) -> Float[np.ndarray, "N B"] | None:
-    """What the training views that see a probed place measured of it; None where fewer than two do."""
-    if scene is None or probe.position is None or probe.opacity < OCCUPIED_ACCUMULATION:
+    scene, training = measured.scene, measured.scene.train_indices
+    pixel = SeenPixel([frame.name for frame in scene.frames].index(view.name), column, row)
+    if not scene.sensor_of(pixel.view).sees_all_bands:
+        job.say(f"{view.name} was taken by a sensor without all bands: no measured spectrum")
         return None
-    place, numbers = torch.from_numpy(probe.position).float(), _with_all_bands(scene)
-    spectra = []
-    for view in job.follow("looking at the place", job.views("train")):
-        index, camera = numbers.get(view.name), view.camera.to("cpu")
-        coords, depths, inside = look_up(camera, 0, place[None])
-        if index is None or not inside[0]:
-            continue
-        column, row = coords[0].long().tolist()
-        seen = job.scene.probe(camera, column, row)
-        near = _SAME_PLACE_PX * float(depths[0] / camera.focal_px[0].min())
-        if seen.position is None or np.linalg.norm(seen.position - probe.position) > near:
-            continue
-        if seen.opacity < OCCUPIED_ACCUMULATION or not _counts(scene, index, column, row):
-            continue
-        alpha = scene.alpha(index)
-        if alpha is None or alpha[row, column] >= _WHOLE:
-            spectra.append(_read_pixel(job, scene, index, column, row).astype(np.float64))
-    if len(spectra) < 2:
-        job.say("fewer than two training views see the place: no spread over views")
+    if not measured.counts(pixel):
+        job.say(
+            f"{view.name} has no valid value in that pixel, or its mask leaves it out: no measured spectrum"
+        )
         return None
-    return np.stack(spectra)
+    if job.scene.view_gains is not None and pixel.view not in training:
+        job.say(f"no exposure was fitted to {view.name}: what it measured is as it was exposed")
+    return measured.spectrum(pixel, job.scene)
 
 
 @dataclass(frozen=True)
@@ -203,9 +172,8 @@ class _ProbedPlace:
     """Known materials that the predicted spectrum resembles, nearest first; none where nothing is."""
     spread: Float[np.ndarray, " B"] | None = None
     """Standard deviation, of a region."""
-    over_views: Float[np.ndarray, "N B"] | None = None
-    """What training views measured, in the light of the prediction; they differ by noise, gloss, light that moves, and
-    what poses or the surface are off."""
+    over_views: MeasuredSpectra | None = None
+    """What training views measured there, in the light of the prediction."""
     unedited: str = ""
     """Words for what was measured, where the prediction is of edited materials."""
 
@@ -224,8 +192,9 @@ def _write_spectrum(folder: Path, place: _ProbedPlace, scene: TrainedScene) -> l
     if place.measured is not None:
         columns[f"measured{place.unedited}"] = place.measured.astype(np.float64)
     if place.over_views is not None:
-        columns[f"mean over views{place.unedited}"] = place.over_views.mean(axis=0)
-        columns[f"standard deviation over views{place.unedited}"] = place.over_views.std(axis=0, ddof=1)
+        columns[f"mean over views{place.unedited}"] = place.over_views.mean
+        if place.over_views.spread is not None:
+            columns[f"standard deviation over views{place.unedited}"] = place.over_views.spread
     if place.spread is not None:
         columns = {"mean": columns["predicted"].clip(min=0), "standard deviation": place.spread}
     values = np.stack(list(columns.values()))
@@ -249,8 +218,8 @@ def _draw_spectrum(place: _ProbedPlace, materials: Materials) -> bytes:
     lines.plot(wavelengths, place.probe.spectra["predicted"], color="black", linewidth=1.8, label="predicted")
     mean, spread, label = place.probe.spectra["predicted"], place.spread, "± 1 std. dev."
     if place.over_views is not None:
-        mean, spread = place.over_views.mean(axis=0), place.over_views.std(axis=0, ddof=1)
-        label = f"{len(place.over_views)} training views{place.unedited}, ± 1 std. dev."
+        mean, spread = place.over_views.mean, place.over_views.spread
+        label = f"{len(place.over_views.views)} training views{place.unedited}, ± 1 std. dev."
     if spread is not None:
         lines.fill_between(wavelengths, mean - spread, mean + spread, color="0.85", label=label)
     for style, shown in zip(("--", "-.", ":"), place.matches, strict=False):
@@ -294,7 +263,7 @@ def _facts(place: _ProbedPlace, materials: Materials) -> dict[str, Any]:
         **place.facts,
         "world_position": None if position is None else position.tolist(),
         "opacity": probe.opacity,
-        "measured_in_views": None if place.over_views is None else len(place.over_views),
+        "measured_in_views": None if place.over_views is None else len(place.over_views.views),
         "material": materials.name_of(probe.spectra["predicted"], probe.abundances) if is_something else None,
         "abundances": shares,
         "library": [match_json(shown.match) for shown in place.matches],

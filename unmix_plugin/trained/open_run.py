@@ -16,9 +16,9 @@ from unmix_plugin.engine.configs import TrainerConfig
 from unmix_plugin.engine.model import Model
 from unmix_plugin.engine.registry import discover_methods, find_method
 from unmix_plugin.engine.runs.checkpoints import TrainingRecord
-from unmix_plugin.engine.runs.load_run import SceneRecord, load_model
-from unmix_plugin.engine.runs.run_folder import RunFolder
-from unmix_plugin.engine.runs.scene_record import differences, name_differences
+from unmix_plugin.engine.runs.load_run import SceneRecord, load_config, load_model
+from unmix_plugin.engine.runs.run_folder import RunFolder, open_run_folder
+from unmix_plugin.engine.runs.scene_record import differences, name_differences, read_scene_record
 from unmix_plugin.errors import ConfigError, RunError, SceneError
 from unmix_plugin.model import UnmixModel
 from unmix_plugin.scenes.reading.loader import load_scene
@@ -26,6 +26,7 @@ from unmix_plugin.scenes.scene import Scene, scene_identity
 from unmix_plugin.settings import SceneOptions
 from unmix_plugin.trained.measures import Measures, Scale, read_measures, recorded_scale
 from unmix_plugin.trained.model_scene import frozen_parameters, model_scene
+from unmix_plugin.trained.places import MeasuredScene
 from unmix_plugin.trained.protocol import RenderableScene
 from unmix_plugin.trained.run_views import recorded_views, world_frame
 from unmix_plugin.trained.trained_scene import TrainedScene, with_cells
@@ -158,6 +159,25 @@ def open_run(path: str | Path, device: str = "auto") -> TrainedScene:
         ConfigError: the device is not there, or the method does not unmix spectra.
     """
     return load_run(path, device).materials_scene
+
+
+def open_measured(path: str | Path, data: str | Path | None = None) -> MeasuredScene:
+    """What a run was trained on, for `spectrum_at`.
+
+    Args:
+        path: Run folder.
+        data: Scene folder, where it is no longer where the run was trained on it.
+    Raises:
+        RunError: the run is damaged, or the scene is another than the run's.
+        SceneError: the scene is missing, has changed, or is malformed.
+    """
+    run = open_run_folder(Path(path))
+    record = read_scene_record(run, load_config(run.path).pipeline.datamanager.target)
+    scene = find_scene(record.summary, run.path, None if data is None else Path(data))
+    if scene is None:
+        place = record.summary.get("root")
+        raise SceneError(f"no scene, or no longer the same, at {place}; say where it is now")
+    return MeasuredScene(scene, record.summary.get("illuminant"))
 
 
 def require_materials(scene: RenderableScene | None, method_name: str) -> TrainedScene:

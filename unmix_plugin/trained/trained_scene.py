@@ -91,12 +91,19 @@ class TrainedScene:
     )
     """sRGB colours that edits gave, or the nearest that they could: by kind of edit (`retint`, `gloss`) and number of
     the endmember."""
+    unedited: TrainedScene | None = None
+    """What edits were made of; None: it is as trained."""
     fitted: tuple[Literal["pose", "gain"], ...] = ()
     """What training found for each of its views, so that other views are aligned before they are measured."""
     scale: Scale | None = None
     """How long a unit of its world is; None where that is unknown."""
     view_gains: Float[Tensor, "V B"] | None = None
     """What is rendered, times this, is as bright as each training view measured it; on the CPU. None: 1."""
+
+    @property
+    def as_trained(self) -> TrainedScene:
+        """The scene before all edits."""
+        return self if self.unedited is None else self.unedited
 
     @property
     def bands(self) -> Bands:
@@ -214,4 +221,7 @@ class TrainedScene:
             with_cells(self.renderer, lambda cells: cells.to(device)), box=self.scene_box.to(device)
         )
         field = copy.deepcopy(self.field).to(device)
-        return replace(self, field=field, renderer=renderer, materials=self.materials.to(device))
+        unedited = None if self.unedited is None else self.unedited.to(device)
+        return replace(
+            self, field=field, renderer=renderer, materials=self.materials.to(device), unedited=unedited
+        )

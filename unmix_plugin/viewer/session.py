@@ -32,7 +32,7 @@ from unmix_plugin.viewer.rendering.painting import legend_html
 from unmix_plugin.viewer.rendering.pictures import DEFAULT_HEIGHT, HEIGHT_BOUNDS, PictureMaker, Shown
 from unmix_plugin.viewer.rendering.regions import RunRegions
 from unmix_plugin.viewer.rendering.render_loop import RenderLoop, View
-from unmix_plugin.viewer.rendering.scene import Edit, MeasuredViews, SceneSource, usable_views
+from unmix_plugin.viewer.rendering.scene import Edit, MeasuredViews, SceneSource
 from unmix_plugin.viewer.rendering.settings import LayerSettings, first_settings
 from unmix_plugin.viewer.rendering.thumbnails import Thumbnails
 from unmix_plugin.viewer.view_cameras import ViewPose, camera_of, point_ahead, pose_from, pose_of
@@ -145,10 +145,10 @@ class Services:
         with failures_said("the scene could not be read", give_up):
             scene = self._read_scene()
             self.thumbnails = Thumbnails(scene)
-            if self.has_materials and usable_views(scene):
-                aids.measured = MeasuredViews(scene, self.source)
-            else:
-                aids.measured = "no training view has all bands"
+            if self.has_materials:
+                views = MeasuredViews(scene, self.source)
+                has_some = bool(views.measured.usable_views)
+                aids.measured = views if has_some else "no training view has all bands"
 
 
 @dataclass(frozen=True)

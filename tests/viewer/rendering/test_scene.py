@@ -22,11 +22,9 @@ from unmix_plugin.spectral.materials import Coefficients, Materials
 from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.trained.run_views import RunView
 from unmix_plugin.trained.trained_scene import TrainedScene
-from unmix_plugin.viewer.panels.probe import _take_probe
 from unmix_plugin.viewer.rendering import aids as aids_module
 from unmix_plugin.viewer.rendering import scene as scene_module
 from unmix_plugin.viewer.rendering.aids import SceneAids
-from unmix_plugin.viewer.rendering.pictures import PictureMaker
 from unmix_plugin.viewer.rendering.scene import Edit, MeasuredViews
 
 
@@ -143,12 +141,6 @@ def difference(scene, index, gain: Any = 1.0, light: Any = 1.0):
     return ((measured / gain - 0.25).abs() * light).mean(dim=-1)
 
 
-def on_ball(camera):
-    """The point of the ball nearest to a camera."""
-    place = camera.camera_to_world[0, :, 3]
-    return BALL * place / place.norm()
-
-
 def test_the_error_at_a_training_view_is_the_difference_to_its_picture(views, scene, ball_of):
     index = scene.train_indices[2]
     frame = ball_of(scene.cameras[index])
@@ -170,16 +162,6 @@ def test_from_between_two_views_only_what_the_nearest_sees_has_an_error(views, s
     assert not bool((is_known & ~hits).any())
 
 
-def test_a_point_is_measured_by_the_view_nearest_to_the_camera_and_one_inside_by_none(views, scene, ball_of):
-    index = scene.train_indices[1]
-    camera = scene.cameras[index]
-    name, spectrum = views.measurement(on_ball(camera), camera, None, ball_of(camera).scene)
-    assert name == scene.frames[index].name
-    column, row = camera.project(on_ball(camera)[None], 0)[0][0].long().tolist()
-    np.testing.assert_allclose(spectrum, scene.cube(index)[row, column])
-    assert views.measurement(torch.zeros(3), camera, None, ball_of(camera).scene) is None
-
-
 def test_pixels_that_do_not_count_are_no_measurement(scene, source, views, ball_of, tmp_path):
     shutil.copytree(scene.root, tmp_path / "holed")
     index = scene.train_indices[1]
@@ -193,9 +175,6 @@ def test_pixels_that_do_not_count_are_no_measurement(scene, source, views, ball_
     _, is_known, _ = holed.error(frame)
     assert torch.equal(is_known, was_known & torch.from_numpy(np.isfinite(cube).all(axis=-1)))
     assert 0 < int(is_known.sum()) < int(was_known.sum())
-    measured: Any = holed.measurement(on_ball(camera), camera, None, frame.scene)
-    assert measured[0] != scene.frames[index].name  # but another view, which sees the point too
-    assert float(measured[1].min()) > 0
 
 
 LIGHT = torch.tensor([0.2, 0.4, 0.6, 0.8, 1.0, 0.5])
@@ -222,21 +201,6 @@ def test_what_was_measured_is_seen_lit_and_exposed_alike(views, scene, ball_of, 
     errors, is_known, _ = views.error(replace(frame, scene=shown))
     expected = difference(scene, index, gains[2], 1.0 if light is None else light)
     assert_close(errors[is_known], expected[is_known], atol=1e-6, rtol=0)
-    plain = views.measurement(on_ball(camera), camera, None, replace(frame.scene, views=corrected))
-    alike = views.measurement(on_ball(camera), camera, shown.light_power, shown)
-    assert_close(alike[1], plain[1] / gains[2] * (1.0 if light is None else light))
-
-
-def test_a_click_takes_one_device_turn_and_is_measured_in_it(views, scene, ball_of, source, monkeypatch):
-    index = scene.train_indices[1]
-    camera = scene.cameras[index]
-    maker = PictureMaker(replace(source, take=lambda: ball_of(camera).scene))
-    maker.aids.measured = views
-    turns, turn = [], source.device.guest_turn
-    monkeypatch.setattr(source.device, "guest_turn", lambda cost: turns.append(cost) or turn(cost))
-    taken = _take_probe(maker, Edit(), camera, (camera.width / 2, camera.height / 2), 1)
-    assert (len(turns), taken.measured_in) == (1, scene.frames[index].name)
-    assert taken.measured == pytest.approx(scene.cube(index)[camera.height // 2, camera.width // 2])
 
 
 def test_an_error_is_shown_though_the_scene_was_read_late(views, scene, ball_of, source, monkeypatch):

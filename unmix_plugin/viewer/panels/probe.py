@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from jaxtyping import Float64
 
 from unmix_plugin.engine.geometry.cameras import Cameras
@@ -23,7 +22,7 @@ from unmix_plugin.trained.protocol import Probe, RenderableScene
 from unmix_plugin.viewer.page import Chart, Line, bars, new_file, number, paragraph, table
 from unmix_plugin.viewer.panels.materials import likeness_rows
 from unmix_plugin.viewer.rendering.pictures import PictureMaker
-from unmix_plugin.viewer.rendering.scene import Edit, MeasuredViews
+from unmix_plugin.viewer.rendering.scene import Edit
 from unmix_plugin.viewer.session import Session
 from unmix_plugin.viewer.view_cameras import camera_of
 
@@ -58,9 +57,9 @@ class _ProbedPoint:
     materials: Materials
     """As they are shown."""
     measured: Float64[np.ndarray, " B"] | None = None
-    """Radiance in a training view that sees the point."""
+    """Mean radiance in the training views that see the point."""
     measured_in: str = ""
-    """Name of that view."""
+    """How many views that are, or the name of the only one."""
 
     @property
     def predicted(self) -> Float64[np.ndarray, " B"]:
@@ -86,18 +85,17 @@ class _ProbedPoint:
 def _take_probe(
     maker: PictureMaker, edit: Edit, camera: Cameras, place: tuple[float, float], number: int
 ) -> _ProbedPoint:
-    """What is seen at a place of a picture, and what a training view measured there."""
-    with maker.edit_turn(edit) as (scene, shown):
+    """What is seen at a place of a picture, and what training views measured there."""
+    views = maker.aids.measured
+    with maker.edit_turn(edit) as (_, shown):
         seen = surface_at(shown, camera, place)
-        measured, point = maker.aids.measured, torch.from_numpy(seen[1]).float()
-        found = None
-        if isinstance(measured, MeasuredViews):
-            found = measured.measurement(point, camera, shown.light_power, scene)
-    if found is None:
+        pixels = () if isinstance(views, str) else views.measured.pixels_that_see(seen[1], shown)
+    measured = None if isinstance(views, str) else views.measured.spectra(pixels, shown)
+    if measured is None:
         return _ProbedPoint(number, *seen, shown.materials)
-    view, spectrum = found
-    view = f"{view}, before the edits" if edit.recipe.operations else view
-    return _ProbedPoint(number, *seen, shown.materials, spectrum.double().numpy(), view)
+    who = measured.views[0] if len(measured.views) == 1 else f"{len(measured.views)} training views, mean"
+    who = f"{who}, before the edits" if edit.recipe.operations else who
+    return _ProbedPoint(number, *seen, shown.materials, measured.mean, who)
 
 
 def _spectra_csv(probes: Sequence[_ProbedPoint]) -> bytes:
@@ -113,7 +111,7 @@ def _spectra_csv(probes: Sequence[_ProbedPoint]) -> bytes:
 
 def _abundances_csv(probes: Sequence[_ProbedPoint], scale: Scale | None = None) -> bytes:
     """One row a probe: number, position in the world, metres in a unit of it (empty where unknown), material, the
-    training view measured in, what the spectra are, the light lit in place of the recorded one, abundances."""
+    training views measured in, what the spectra are, the light lit in place of the recorded one, abundances."""
     metres = "" if scale is None else f"{scale.metres_per_unit:.9g}"
     header = ["probe", "x", "y", "z", METRES_KEY, "material", "measured_in", "quantity", "light"]
     names = dict.fromkeys(name for one in probes for name in one.materials.names)  # renamed between probes

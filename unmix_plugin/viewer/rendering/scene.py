@@ -8,13 +8,13 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Float64, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from unmix_plugin.editing import Recipe, changes_geometry, edit_scene
@@ -30,8 +30,8 @@ from unmix_plugin.trained.measures import Scale, read_measures, recorded_scale
 from unmix_plugin.trained.model_scene import LightChoice, relit
 from unmix_plugin.trained.open_run import LoadedRun, require_materials, snapshot
 from unmix_plugin.trained.outputs import MaterialView
+from unmix_plugin.trained.places import MeasuredScene, same_places
 from unmix_plugin.trained.protocol import RenderableScene
-from unmix_plugin.trained.run_materials import relit as relit_measurement
 from unmix_plugin.trained.surface import in_image
 from unmix_plugin.trained.trained_scene import TrainedScene
 
@@ -171,32 +171,22 @@ class Edit:
             return edited
 
 
-_TOLERANCE = 0.03
-"""Depths of a point and of what a view renders there may differ by so much of the depth."""
-
 _VIEWS_KEPT = 4
-_VIEWS_TRIED = 6
-
-
-def usable_views(scene: Scene) -> list[int]:
-    """Training views whose spectra can be put beside those of the model."""
-    return [index for index in scene.train_indices if scene.sensor_of(index).sees_all_bands]
 
 
 class MeasuredViews:
     """The training views of a scene that is at hand, of a rig those with all bands."""
 
     def __init__(self, scene: Scene, source: SceneSource) -> None:
-        self._scene = scene
+        self.measured = MeasuredScene(scene, source.record.summary.get("illuminant"))
+        """What places measured, as exports have it."""
         self._source = source
-        self._indices = usable_views(scene)
-        self._rows = [scene.train_indices.index(index) for index in self._indices]
         self._distances = Renewed(_VIEWS_KEPT)
 
     def error(self, frame: MaterialView) -> tuple[Float[Tensor, "H W"], Bool[Tensor, "H W"], str]:
         """Mean absolute error of the bands against the nearest training view, where that measured the same point; where
         it is known; the name of the view."""
-        index = int(self._by_nearness(frame.camera, frame.scene)[0])
+        scene, index = self.measured.scene, self._nearest(frame.camera, frame.scene)
         coefficients, device = frame.coefficients.flatten(), frame.coefficients.accumulation.device
         errors = torch.zeros(frame.camera.height * frame.camera.width)
         is_known = torch.zeros(len(errors), dtype=torch.bool)
@@ -204,87 +194,44 @@ class MeasuredViews:
         if len(seen):
             rays = frame.camera.to(device).image_rays(0)
             points = (rays.origins + coefficients.ray_distance[:, None] * rays.directions)[seen]
-            pixels, sees = self._pixels_of(points, index, self._camera(index, frame.scene))
-            measured = self._scene.cube(self._indices[index], pixels)
-            measured = self._comparable(index, measured, frame.scene, frame.scene.light_power)
+            pixels, sees = self._pixels_of(points.cpu(), index, self.measured.camera(index, frame.scene))
+            measured = self.measured.comparable(index, scene.cube(index, pixels), frame.scene)
             spectra = frame.materials.spectra(coefficients.map(lambda packed: packed[seen[sees]])).cpu()
             places = seen[sees].cpu()
-            errors[places] = (spectra - measured).abs().mean(dim=-1)
+            errors[places] = (spectra - torch.from_numpy(measured).float()).abs().mean(dim=-1)
             is_known[places] = True
         shape = (frame.camera.height, frame.camera.width)
-        name = self._scene.frames[self._indices[index]].name
-        return errors.view(shape).to(device), is_known.view(shape).to(device), name
+        return errors.view(shape).to(device), is_known.view(shape).to(device), scene.frames[index].name
 
-    def measurement(
-        self,
-        point: Float[Tensor, "3"],
-        camera: Cameras,
-        light: Float64[np.ndarray, " B"] | None,
-        scene: TrainedScene,
-    ) -> tuple[str, Float32[Tensor, "B"]] | None:
-        """Name of the training view nearest to a camera that sees a point of model space in a pixel that counts, and
-        the radiance measured there, relit to the light that the scene is shown in (None if unknown); None where no view
-        tried sees it. `scene` is the unedited one, which is lent."""
-        for index in self._by_nearness(camera, scene)[:_VIEWS_TRIED].tolist():
-            own = self._camera(index, scene)
-            pixels, sees = self._pixels_of(point[None], index, own, scene)
-            if bool(sees[0]):
-                measured = self._scene.cube(self._indices[index], pixels)
-                spectrum = self._comparable(index, measured[0], scene, light)
-                return self._scene.frames[self._indices[index]].name, spectrum
-        return None
-
-    def _comparable(
-        self,
-        index: int,
-        measured: Float32[np.ndarray, "*pixels B"],
-        scene: TrainedScene,
-        light: Float64[np.ndarray, " B"] | None,
-    ) -> Float32[Tensor, "*pixels B"]:
-        """Radiance of a training view as it is in the light that the scene is shown in, and as exposed as the scene."""
-        recorded = self._source.record.summary.get("illuminant")
-        is_same = light is None or (recorded is not None and np.allclose(light, recorded, rtol=1e-4))
-        found = measured if is_same else relit_measurement(measured, recorded, light).astype(np.float32)
-        spectra = torch.from_numpy(found)
-        return spectra if scene.view_gains is None else spectra / scene.view_gains[self._rows[index]]
-
-    def _camera(self, index: int, scene: TrainedScene) -> Cameras:
-        return scene.views[self._rows[index]].camera
-
-    def _by_nearness(self, camera: Cameras, scene: TrainedScene) -> Tensor:
-        """Training views by the angle between their axis and the camera's, and by their distance to it."""
-        middle = self._scene.scene_box.aabb.mean(dim=0)
-        own = [self._camera(index, scene).camera_to_world for index in range(len(self._rows))]
-        pose, poses = camera.camera_to_world[0].cpu(), torch.cat(own).cpu()
+    def _nearest(self, camera: Cameras, scene: TrainedScene) -> int:
+        """The training view that is nearest by the angle between its axis and the camera's, and its distance to it."""
+        usable = self.measured.usable_views
+        poses = torch.cat([self.measured.camera(index, scene).camera_to_world for index in usable])
+        pose, middle = camera.camera_to_world[0].cpu(), self.measured.scene.scene_box.aabb.mean(dim=0)
         reach = (pose[:, 3] - middle).norm().clamp(min=1e-3)
         offsets = (poses[:, :, 3] - pose[:, 3]).norm(dim=-1) / reach
         angles = (poses[:, :, 2] * pose[:, 2]).sum(dim=-1).clamp(-1, 1).arccos()
-        return (offsets + angles).argsort()
+        return usable[int((offsets + angles).argmin())]
 
     def _pixels_of(
-        self, points: Float[Tensor, "P 3"], index: int, camera: Cameras, lent: TrainedScene | None = None
+        self, points: Float[Tensor, "P 3"], index: int, camera: Cameras
     ) -> tuple[tuple[Int[np.ndarray, " seen"], Int[np.ndarray, " seen"]], Bool[Tensor, "P"]]:
         """Which points a training view sees in a pixel that counts, and the rows and columns of these."""
-        camera, points = camera.to("cpu"), points.cpu()
-        sees, coords, _ = in_image(camera, points)
-        columns, rows = coords.long().unbind(-1)
-        places = camera.poses_at(torch.zeros_like(rows), coords[:, 1])[:, :, 3]
-        distance = (points[sees] - places).norm(dim=-1)
-        rendered = self._distance_of(index, camera, lent)[rows, columns]
-        is_near = (distance - rendered).abs() < _TOLERANCE * distance
-        rows, columns = rows[is_near].numpy(), columns[is_near].numpy()
+        sees, coords, depths = in_image(camera, points)
+        is_near = same_places(camera, points[sees], coords, depths, self._distance_of(index, camera))
+        columns, rows = coords[is_near].long().numpy().T
         sees[sees.clone()] = is_near
         if len(rows):
-            counts = self._scene.valid_mask(self._indices[index], (rows, columns))
+            counts = self.measured.scene.valid_mask(index, (rows, columns))
             rows, columns = rows[counts], columns[counts]
             sees[sees.clone()] = torch.from_numpy(counts)
         return (rows, columns), sees
 
-    def _distance_of(self, index: int, camera: Cameras, lent: TrainedScene | None) -> Float[Tensor, "H W"]:
+    def _distance_of(self, index: int, camera: Cameras) -> Float[Tensor, "H W"]:
         """Distances along the rays of a training view as last rendered, infinite where nothing is."""
 
         def render() -> Float[Tensor, "H W"]:
-            with self._source.borrowed_materials() if lent is None else nullcontext(lent) as scene:
+            with self._source.borrowed_materials() as scene:
                 seen = scene.look(camera, subpixels=1).coefficients
             return seen.ray_distance.where(seen.is_occupied, torch.inf).cpu()
 
