@@ -54,7 +54,7 @@ def without_pictures(content: dict) -> None:
 
 
 def edit_cubes(folder: Path, change: Callable[[str, np.ndarray], np.ndarray]) -> Path:
-    for path in sorted((folder / "cubes").iterdir()):
+    for path in sorted((folder / "cubes").glob("[!.]*")):
         cube = np.load(path)
         np.save(path, change(path.stem, cube).astype(cube.dtype))
     return folder

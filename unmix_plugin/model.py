@@ -31,6 +31,7 @@ from unmix_plugin.engine.model import (
     TrainingCallbackLocation,
     TrainOutputs,
 )
+from unmix_plugin.engine.runs.replacing import foreign, move_aside
 from unmix_plugin.field import CoefficientField, UnmixField
 from unmix_plugin.light.lamp import Lamp
 from unmix_plugin.light.shading import ShadowDetail
@@ -348,7 +349,10 @@ class UnmixModel(Model):
 
     def write_results(self, folder: Path) -> None:
         """Write the endmembers that evaluation and exports will use: `endmembers.csv`."""
-        write_spectra_csv(folder / "endmembers.csv", self.materials.table())
+        path = folder / "endmembers.csv"
+        for changed in foreign([path]):  # by its user, who goes on with the run: both are kept
+            move_aside(changed, "changed")
+        write_spectra_csv(path, self.materials.table())
 
     @property
     def _training_renderer(self) -> VolumeRenderer:

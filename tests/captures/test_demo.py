@@ -55,7 +55,7 @@ def read_counts(path):
 
 def test_the_folder_holds_views_references_true_poses_and_truth(folder):
     names = [f"view_{index:03d}" for index in range(VIEWS)]
-    files = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+    files = {path.relative_to(folder).as_posix() for path in folder.rglob("[!.]*") if path.is_file()}
     assert files == {
         *(f"{name}{suffix}" for name in (*names, "white", "dark") for suffix in (".hdr", ".raw")),
         *(f"truth/{name}.png" for name in names),
@@ -94,7 +94,7 @@ def test_a_capture_written_again_has_the_same_bytes_and_no_view_of_the_older_one
     (tmp_path / "view_of_mine.hdr").write_text("mine")
     make_demo_capture(tmp_path, SIZE, BANDS, VIEWS, overwrite=True)
     (tmp_path / "view_of_mine.hdr").unlink()
-    for path in tmp_path.rglob("*"):
+    for path in tmp_path.rglob("[!.]*"):
         assert path.is_dir() or path.read_bytes() == (folder / path.relative_to(tmp_path)).read_bytes(), path
 
 

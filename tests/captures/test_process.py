@@ -28,6 +28,7 @@ from unmix_plugin.captures.layouts.cubes import find_cubes
 from unmix_plugin.captures.spectral_file import ReadOptions
 from unmix_plugin.captures.wavelengths import parse_wavelengths
 from unmix_plugin.captures.writing.view_files import FULL_SCALE, write_view
+from unmix_plugin.engine.runs.replacing import LIST_NAME
 from unmix_plugin.errors import CaptureError, ConfigError, RunError
 from unmix_plugin.scenes.reading.loader import load_scene
 
@@ -313,18 +314,21 @@ def test_two_processes_do_not_write_one_scene(interrupted, writer, tmp_path: Pat
 
 
 def test_the_next_start_goes_on_with_the_next_view(interrupted, writer, tmp_path: Path):
-    """And with those whose record is damaged."""
+    """A record that was changed is somebody's, and refused; one that is gone is written again."""
     unfinished = tmp_path / "scene.unfinished"
     assert not (tmp_path / "scene").exists()
     assert len(list((unfinished / "cubes").glob("*.npy"))) == 2
     assert not (unfinished / "transforms.json").exists()
     (unfinished / "views" / "view_00.json").write_text('{"name": "view')
+    with pytest.raises(ConfigError, match=r"view_00\.json is in the way"):
+        process(interrupted.root, tmp_path / "scene")
+    (unfinished / "views" / "view_00.json").unlink()
     process(interrupted.root, tmp_path / "scene")
     assert writer.written == ["view_00", "view_02", "view_03"]
     assert not unfinished.exists()
     process(interrupted.root, tmp_path / "whole")
     for path in sorted((tmp_path / "whole").rglob("*")):
-        if path.is_file() and path.name != "process.json":
+        if path.is_file() and path.name not in ("process.json", LIST_NAME):
             mine = tmp_path / "scene" / path.relative_to(tmp_path / "whole")
             assert mine.read_bytes() == path.read_bytes()
     assert len(load_scene(tmp_path / "scene").frames) == 4

@@ -16,6 +16,7 @@ from unmix_plugin.commands.export import export
 from unmix_plugin.commands.render import render
 from unmix_plugin.commands.train import train
 from unmix_plugin.commands.view import view
+from unmix_plugin.engine.runs.replacing import LIST_NAME
 
 COMMANDS = [(evaluate, ["--run"]), (export, ["abundances", "--run"]), (render, ["--run"])]
 COMMANDS += [(train, ["unmix-nerf", "--load-run"]), (view, ["--run"])]
@@ -129,7 +130,7 @@ def test_a_full_disk_exits_2_says_where_and_leaves_whole_files_only(
     assert re.search(rf"can't write \S*{file}: No space left on device; make room", said)
     assert "--load-run" not in said
     left = [*contents(tmp_path / "out"), *(set(contents(run_copy)) - before)]
-    assert {path.name for path in left} <= {"cameras-dataset-eval.json", "run.log"}
+    assert {path.name for path in left} <= {"cameras-dataset-eval.json", "run.log", LIST_NAME}
 
 
 NO_FIGURES = ['{"psnr": 1' + "0" * 400 + "}", '{"psnr": "high"}', '{"psnr": NaN}']

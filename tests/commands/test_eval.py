@@ -69,7 +69,7 @@ def test_figures_are_means_over_the_views_of_what_the_model_renders(evaluated):
 def test_each_view_gets_three_pictures_and_all_that_was_written_is_named(evaluated):
     path, ended = evaluated
     for kind in ("rgb", "segmentation", "abundances"):
-        pictures = sorted((path / "eval" / kind).iterdir())
+        pictures = sorted((path / "eval" / kind).glob("[!.]*"))
         assert [picture.name for picture in pictures] == ["eval_002.png", "eval_006.png"]
         for picture in pictures:
             assert min(picture_size(picture)) > 200

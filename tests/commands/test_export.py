@@ -36,7 +36,7 @@ pytestmark = pytest.mark.usefixtures("coarse_surfaces")
 
 
 def test_views_are_chosen_by_split_and_named_as_the_frames(trained, tmp_path):
-    frames = {path.stem for path in (trained.scene / "cubes").iterdir()}
+    frames = {path.stem for path in (trained.scene / "cubes").glob("[!.]*")}
     for views, count in (("train", 6), ("all", 8)):
         folder = tmp_path / views
         words = ["--run", trained.run, "--output", folder, "--views", views, "--formats", "npy"]
@@ -87,7 +87,7 @@ def test_products_that_fail_or_whose_name_is_taken_are_skipped_and_said(own):
 @pytest.mark.parametrize("name", PRODUCT_NAMES)
 def test_every_file_written_is_named_and_nothing_else_is_there(exported, name):
     root, said = exported
-    files = sorted(str(path) for path in (root / name).rglob("*") if path.is_file())
+    files = sorted(str(path) for path in (root / name).rglob("[!.]*") if path.is_file())
     assert files
     lines = said[name].splitlines()
     assert sorted(line for line in lines if line.startswith(str(root))) == files
@@ -97,19 +97,26 @@ def test_every_file_written_is_named_and_nothing_else_is_there(exported, name):
 @pytest.mark.parametrize("name", PRODUCT_NAMES)
 def test_a_file_is_replaced_only_by_overwrite_also_edited_and_relit(solid, exported, tmp_path, name):
     copy = shutil.copytree(exported[0] / name, tmp_path / name)
-    *others, victim = sorted(path for path in copy.rglob("*") if path.is_file())
+    *others, victim = sorted(path for path in copy.rglob("[!.]*") if path.is_file())
     for path in others:
         path.unlink()
+    ours = victim.read_bytes()
     victim.write_bytes(b"mine")
     given = words(name, "--run", solid.run, "--output", copy)
     said = refused(export, *given)
     assert str(victim) in said
     assert "--overwrite" in said
-    assert [path.read_bytes() for path in copy.rglob("*") if path.is_file()] == [b"mine"]
+    assert [path.read_bytes() for path in copy.rglob("[!.]*") if path.is_file()] == [b"mine"]
     recipe = tmp_path / "recipe.yml"
     recipe.write_text("edits:\n  - rename: {endmember: 0, name: old oak}\n")
-    done(export, *given, "--overwrite", "--edits", recipe, "--illuminant", "A")
-    assert victim.read_bytes() != b"mine"
+    edited = (*given, "--overwrite", "--edits", recipe, "--illuminant", "A")
+    assert f"{victim} is in the way" in refused(export, *edited)
+    assert victim.read_bytes() == b"mine"
+    victim.write_bytes(ours)
+    victim.touch()
+    before = victim.stat().st_ino
+    done(export, *edited)
+    assert victim.stat().st_ino != before
     if name == "endmembers":
         with (copy / "endmembers.csv").open() as file:
             lit = [float(row["old oak"]) for row in csv.DictReader(file)]
@@ -127,7 +134,7 @@ def test_every_product_comes_from_the_run_folder_alone(solid, solid_copy, tmp_pa
     try:
         for name in PRODUCT_NAMES:
             done(export, *words(name, "--run", solid_copy))
-            assert list((solid_copy / "exports" / name).iterdir())
+            assert list((solid_copy / "exports" / name).glob("[!.]*"))
     finally:
         shutil.move(tmp_path / "elsewhere", solid.scene)
     with (solid_copy / "exports/spectrum/eval_002_x8_y8.csv").open() as file:
@@ -141,7 +148,7 @@ def test_more_views_are_segmented_into_a_folder_with_the_same_legend(solid, tmp_
     common = ["--run", solid.run, "--output", tmp_path, "--device", "cpu"]
     done(export, "segmentation", *common)
     done(export, "segmentation", "--views", "train", *common)
-    assert len(list((tmp_path / "labels").iterdir())) == 8
+    assert len(list((tmp_path / "labels").glob("[!.]*"))) == 8
     (tmp_path / "legend.csv").write_text("mine")
     shutil.rmtree(tmp_path / "labels")
     for path in (*tmp_path.glob("*.npy"), *tmp_path.glob("*.png")):

@@ -18,7 +18,7 @@ pytestmark = pytest.mark.usefixtures("no_wait_for_the_disk")
 
 
 def files(folder):
-    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("[!.]*") if path.is_file())
 
 
 def rendered(loaded, index, *names):
@@ -122,14 +122,16 @@ def test_a_recipe_and_another_light_are_rendered_as_the_edited_model_does(traine
 def test_files_of_an_earlier_render_are_kept_unless_overwrite_is_given(trained, tmp_path):
     words = ["--run", trained.run, "--output", tmp_path, "--outputs", "rgb", "depth"]
     done(render, *words)
-    for name in files(tmp_path):
-        if not name.startswith("cameras"):
-            (tmp_path / name).write_bytes(b"mine")
     (tmp_path / "rgb" / "eval_002.png").unlink()
     assert "--overwrite" in refused(render, *words)
     assert not (tmp_path / "rgb" / "eval_002.png").exists()
-    done(render, *words, "--overwrite")
-    assert b"mine" not in {(tmp_path / name).read_bytes() for name in files(tmp_path)}
+    before = (tmp_path / "rgb" / "eval_006.png").read_bytes()
+    done(render, *words, "--overwrite", "--illuminant", "A")
+    assert (tmp_path / "rgb" / "eval_006.png").read_bytes() != before
+    assert (tmp_path / "rgb" / "eval_002.png").exists()
+    (tmp_path / "rgb" / "eval_002.png").write_bytes(b"mine")
+    assert "eval_002.png is in the way" in refused(render, *words, "--overwrite")
+    assert (tmp_path / "rgb" / "eval_002.png").read_bytes() == b"mine"
     # Further outputs of the same cameras may join them.
     done(render, *words[:-2], "accumulation")
     assert "cameras-dataset-eval.json" in refused(render, *words[:-2], "pca", "--downscale", 2)

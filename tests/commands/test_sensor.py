@@ -60,8 +60,8 @@ def test_a_render_has_the_sensors_bands(solid, camera, tmp_path):
 
 def test_known_spectra_are_not_compared_with_broad_channels(solid, camera, tmp_path):
     words = ["--run", solid.run, "--device", "cpu", "--output", tmp_path / "out", "--sensor", camera]
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "angles.csv").write_text("of an earlier export without a sensor")
+    done(export, "endmembers", *words[:-2])
+    assert (tmp_path / "out" / "angles.csv").exists()
     said = " ".join(done(export, "endmembers", *words, "--overwrite").out.split())
     assert "without angles.csv: known spectra are compared in the run's own bands" in said
     assert not (tmp_path / "out" / "angles.csv").exists()

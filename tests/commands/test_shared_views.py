@@ -14,7 +14,9 @@ pytestmark = pytest.mark.usefixtures("no_wait_for_the_disk")
 
 
 def written(folder):
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    return {
+        str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("[!.]*") if path.is_file()
+    }
 
 
 def test_a_video_and_stills_are_the_same_from_two_processes_even_of_an_odd_number_of_views(trained, tmp_path):

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from tests.formats.cubes import full_disk, random_cube
-from unmix_plugin.engine.runs import atomic_files
+from unmix_plugin.engine.runs import atomic_files, replacing
 from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.formats.files import (
     NOT_PLAIN,
@@ -47,7 +47,7 @@ def test_a_full_disk_keeps_the_old_file_and_says_what_to_do(tmp_path, monkeypatc
     monkeypatch.setattr(os, "write", full)
     with pytest.raises(RunError, match=f"can't write .*file.npy: {advice}"):
         write_file(path, b"new")
-    assert [file.read_bytes() for file in path.parent.iterdir()] == [old]
+    assert [file.read_bytes() for file in path.parent.glob("[!.]*")] == [old]
 
 
 def test_a_file_that_somebody_reads_is_replaced_once_it_is_free(tmp_path, monkeypatch):
@@ -60,7 +60,7 @@ def test_a_file_that_somebody_reads_is_replaced_once_it_is_free(tmp_path, monkey
             raise refusals.pop()
         return replace(self, target)
 
-    monkeypatch.setattr(atomic_files, "_READERS_S", (0.0, 0.0, 0.0))
+    monkeypatch.setattr(replacing, "_READERS_S", (0.0, 0.0, 0.0))
     monkeypatch.setattr(Path, "replace", busy)
     write_file(path, b"new")
     assert path.read_bytes() == b"new"
@@ -79,6 +79,10 @@ def test_existing_files_are_counted_and_refused_unless_overwriting_was_asked_for
     paths[1].unlink()
     with pytest.raises(ConfigError, match=r"c exists already; give --overwrite or another folder"):
         refuse_to_overwrite(paths, overwrite=False)
+    with pytest.raises(RunError, match=r"c is in the way: unmix-nerf did not write it"):
+        refuse_to_overwrite(paths, overwrite=True)
+    paths[2].unlink()
+    write_file(paths[2], b"ours")
     refuse_to_overwrite(paths, overwrite=True)
 
 

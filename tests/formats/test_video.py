@@ -46,7 +46,7 @@ def test_odd_sizes_are_made_even_by_showing_the_last_line_twice_and_other_sizes_
         video_frames(tmp_path / "other.mp4", 47, 31, 24.0) as add,
     ):
         add(np.zeros((32, 50, 3), np.uint8))
-    assert [path.name for path in tmp_path.iterdir()] == ["v.mp4"]
+    assert [path.name for path in tmp_path.glob("[!.]*")] == ["v.mp4"]
 
 
 def write(path, count, end=None):

@@ -42,7 +42,7 @@ def test_pixels_of_a_world_with_a_sky_are_opaque_where_they_show_light(view, tmp
 
 
 def test_every_suffix_holds_the_numbers_of_the_view_and_a_file_that_is_there_is_replaced(view, tmp_path):
-    (tmp_path / "cube.npy").write_bytes(b"old")
+    save(view, "depth", tmp_path / "cube.npy")
     np.testing.assert_array_equal(np.load(save(view, "spectral", tmp_path / "cube.npy")), view["spectral"])
     image: Any = envi.open(save(view, "spectral", str(tmp_path / "some.cube.hdr")))
     np.testing.assert_array_equal(np.array(image.open_memmap()), view["spectral"].numpy())

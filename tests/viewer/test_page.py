@@ -1,6 +1,7 @@
 """What comes from a browser is made harmless; nothing that a user typed is ever markup."""
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from hypothesis import strategies as st
 
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.figures.pictures import ColourScale
+from unmix_plugin.formats.files import write_file
 from unmix_plugin.viewer import page
 from unmix_plugin.viewer.page import Debounced, choice, new_file, number, text
 from unmix_plugin.viewer.rendering.painting import legend_html
@@ -61,10 +63,23 @@ def test_no_file_is_ever_overwritten_and_endless_files_of_one_name_are_refused(t
     for expected in ("shot.png", "shot-2.png", "shot-3.png"):
         path = new_file(tmp_path, "shot", ".png", "view")
         assert path.name == expected
-        path.touch()
-    monkeypatch.setattr(Path, "exists", lambda _: True)
+        assert path.read_bytes() == b""  # which claims the name
+    monkeypatch.setattr("unmix_plugin.viewer.page.claim", lambda _: False)
     with pytest.raises(ConfigError, match="too many files named shot"):
         new_file(tmp_path, "shot", ".png", "view")
+
+
+def test_pages_that_save_at_once_get_files_of_their_own(tmp_path):
+    def save(number):
+        for index in range(5):
+            content = f"{number} {index}".encode() * 1000
+            write_file(new_file(tmp_path, "recipe", ".yml", "recipe"), content)
+
+    with ThreadPoolExecutor(5) as pool:
+        list(pool.map(save, range(5)))
+    found = {path.read_bytes()[:3] for path in tmp_path.glob("[!.]*")}
+    assert found == {f"{number} {index}".encode() for number in range(5) for index in range(5)}
+    assert len(list(tmp_path.glob("[!.]*"))) == 25
 
 
 def test_work_is_done_once_after_the_last_event_or_at_once_if_there_is_some():

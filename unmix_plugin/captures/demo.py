@@ -13,7 +13,6 @@ Notation: `B` bands, `W` columns, `h` rows. Light is relative to a white matt pa
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -22,6 +21,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32, UInt16
 
+from unmix_plugin.engine.runs.replacing import move_files
 from unmix_plugin.errors import ConfigError, install_hint
 from unmix_plugin.formats.envi import UINT16, beside, cube_entries, header_bytes, wavelength_entries
 from unmix_plugin.scenes.demo.scene import (
@@ -84,7 +84,6 @@ _BOARD_ANGLE_DEG = 52.0
 POSES = "poses-true.json"
 Backdrop = Callable[[Float[np.ndarray, "R 3"], Float[np.ndarray, "R 3"]], Float[np.ndarray, " R"]]
 """From origins and directions of rays to the light that a grey backdrop sends along them."""
-_OURS = re.compile(r"(view_\d{3,}|white|dark)\.(hdr|raw)|view_\d{3,}\.png")
 
 
 def make_demo_capture(
@@ -120,7 +119,7 @@ def make_demo_capture(
     sampling = Bands.of(band_centers_nm(bands))
     lamp = lamp_power(sampling.centers_nm, illuminant)
     cameras, spectra = place.cameras(size, views), reflectances(sampling.centers_nm)
-    with staging_for(directory, "the demo capture", overwrite) as staging:
+    with staging_for(directory, "the demo capture", overwrite, POSES) as staging:
         truth = staging / "truth"
         truth.mkdir()
         write_spectra_csv(truth / "endmembers.csv", SpectraTable(sampling, MATERIALS, spectra))
@@ -145,7 +144,7 @@ def make_demo_capture(
             frames.append({"file_path": f"{name}.hdr", "transform_matrix": transform_matrix(cameras, index)})
         content = json.dumps(lens_entries(cameras) | {"frames": frames}, indent=1) + "\n"
         (staging / POSES).write_text(content, encoding="utf-8")
-        _move_files(staging, directory)
+        move_files(staging, directory, POSES)
 
 
 def marked_place(things: Sequence[Thing] | None = None) -> Place:
@@ -196,18 +195,6 @@ def _write_counts(
     entries["bbl"] = [str(int(band not in camera.marked)) for band in range(num_bands)]
     beside(path_without_suffix, ".raw").write_bytes(counts.astype("<u2").transpose(0, 2, 1).tobytes())
     beside(path_without_suffix, ".hdr").write_bytes(header_bytes(entries))
-
-
-def _move_files(built: Path, directory: Path) -> None:
-    """Put a capture into a folder in place of an older one."""
-    for folder in (directory, directory / "truth"):
-        folder.mkdir(exist_ok=True)
-        for stale in folder.iterdir():
-            if _OURS.fullmatch(stale.name):
-                stale.unlink()
-    for path in sorted(built.rglob("*")):
-        if path.is_file():
-            path.replace(directory / path.relative_to(built))
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-import shutil
+import os
+import re
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import asdict, replace
@@ -16,6 +17,7 @@ from unmix_plugin.captures.calibration.references import require_comparable
 from unmix_plugin.captures.finding_poses import check_pose_options, marked_poses, poses_of_written_views
 from unmix_plugin.captures.options import LAYOUTS, ProcessOptions, find_views
 from unmix_plugin.captures.plan import Plan, hashes, input_files, make_plan
+from unmix_plugin.captures.poses.estimation import WORK_FILES
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.posing import (
     FROM_PICTURES,
@@ -36,11 +38,16 @@ from unmix_plugin.captures.wavelengths import parse_wavelengths
 from unmix_plugin.captures.writing.resampling import Resampling
 from unmix_plugin.captures.writing.scene_files import RECORD_NAME, write_scene_files
 from unmix_plugin.captures.writing.view_files import ViewRecord, write_view
-from unmix_plugin.engine.runs.atomic_files import (
-    make_folder,
+from unmix_plugin.engine.runs.atomic_files import make_folder, write_errors_as, write_file
+from unmix_plugin.engine.runs.replacing import (
+    TEMPORARY,
+    is_ours,
+    move_aside,
+    refuse_folder,
+    remove,
+    remove_folder,
     remove_stale_temporaries,
-    write_errors_as,
-    write_file,
+    require_apart,
 )
 from unmix_plugin.engine.runs.run_folder import RunLock
 from unmix_plugin.errors import CaptureError, ConfigError, did_you_mean, name_some
@@ -65,6 +72,9 @@ def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list
     """
     _check(options)
     _refuse_output(options.output_dir, options.overwrite)
+    folder = _WorkFolder(options.output_dir)
+    folder.refuse_foreign()
+    require_apart((folder.output, folder.path), _paths_read(options))
     references = _open_references(options)
     capture = _open_capture(options, references)
     say(f"{capture.root}: {len(capture.views)} views of the layout {capture.layout}")
@@ -80,7 +90,10 @@ def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list
     if options.poses == MARKERS:
         say("looking for markers ...")
         posed = pose_views(plan.views, marked_poses(plan, options), known)
-    folder = _WorkFolder(options.output_dir)
+    require_apart(
+        (folder.output, folder.path),
+        [("the capture's", path) for view in capture.views for path in input_files(view)],
+    )
     resampled = {} if posed is None else _resampled_lenses(plan, posed)
     if folder.begin(
         {**plan.fingerprint(options), "lenses": sorted(numbers for _, numbers in resampled.values())}
@@ -108,8 +121,7 @@ def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list
     for note in posed.notes:
         say(f"poses: {note}")
     findings = write_scene_files(folder.path, plan, posed, records, options)
-    folder.finish(options.overwrite)
-    return findings
+    return [*findings, *folder.finish(options.overwrite)]
 
 
 def _resampled_lenses(plan: Plan, posed: PosedViews) -> dict[str, tuple[Lens, list[float]]]:
@@ -165,11 +177,25 @@ def _open_capture(options: ProcessOptions, references: Sequence[SpectralFile | N
     first: dict[str, SpectralFile] = {}
     for view in capture.views:
         _refuse_unlike(view.cube, first.setdefault(view.sensor, view.cube))
-    output = options.output_dir.resolve()
-    for view in capture.views:
-        if any(path.resolve().is_relative_to(output) for path in input_files(view)):
-            raise ConfigError(f"--output-dir {options.output_dir} holds files of the capture")
     return capture
+
+
+def _paths_read(options: ProcessOptions) -> list[tuple[str, Path]]:
+    """What the options name that is read, each with its flag."""
+    named = [("--data", options.data), ("--dark", options.dark), ("--white", options.white)]
+    named += [
+        (flag, Path(text))
+        for flag, text in (
+            ("--poses", options.poses),
+            ("--angles", options.angles),
+            ("--wavelengths", options.wavelengths),
+            ("--white-reflectance", options.white_reflectance),
+        )
+        if text is not None
+    ]
+    if options.poses is not None:
+        named.append(("--poses", options.data / options.poses))
+    return [(flag, path) for flag, path in named if path is not None and os.path.lexists(path)]
 
 
 def _by_size(capture: Capture) -> Capture:
@@ -220,6 +246,8 @@ def _refuse_unlike(cube: SpectralFile, first: SpectralFile) -> None:
 # The unfinished folder beside the output, in which the scene gathers.
 
 _PLAN, _VIEWS, _POSES, _LOCK = "plan.json", "views", "poses", "process.lock"
+_SCRATCH = re.compile(rf"{_LOCK}|(.*/)?{TEMPORARY.pattern}|{_POSES}/({WORK_FILES.pattern})")
+"""What the unfinished folder has beside listed files: the lock, what killed writers left, and COLMAP's files."""
 
 
 class _WorkFolder:
@@ -234,6 +262,14 @@ class _WorkFolder:
         self.poses = self.path / _POSES
         """Where files of the estimation of poses lie while it runs, or after it failed."""
 
+    def refuse_foreign(self) -> None:
+        """Look before anything is computed whether the folder is this command's, and holds nothing else. Raises
+        ConfigError."""
+        if os.path.lexists(self.path):
+            if self.path.is_dir() and any(self.path.iterdir()) and not is_ours(self.path / _PLAN):
+                raise ConfigError(f"{self.path} is in the way and was not made by unmix-process; rename it")
+            refuse_folder(self.path, _SCRATCH)
+
     def begin(self, plan: dict[str, Any]) -> bool:
         """Make the folder, or go on in the one that an interrupted start left.
 
@@ -242,23 +278,22 @@ class _WorkFolder:
         Returns:
             Whether an earlier start is gone on with.
         Raises:
-            ConfigError: there is a folder of this name that is not ours.
+            ConfigError: there is a folder of this name that is not ours, or has something in it that is not.
             RunError: it can't be written.
         """
         plan_file, text = self.path / _PLAN, _json(plan)
         if plan_file.is_file():
             self._hold()
-        if self.path.exists():
-            if not plan_file.is_file() and any(self.path.iterdir()):
-                raise ConfigError(f"{self.path} is in the way and was not made by unmix-process; rename it")
-            if plan_file.is_file() and plan_file.read_bytes() == text:
+        self.refuse_foreign()
+        if plan_file.is_file():
+            if plan_file.read_bytes() == text:
                 for folder in ("cubes", "images", "masks", _VIEWS):
                     remove_stale_temporaries(self.path / folder)
                 return True
             if self._lock is not None:
                 self._lock.release()  # Windows removes no file that is open
             with write_errors_as(self.path):
-                shutil.rmtree(self.path)
+                remove_folder(self.path, _SCRATCH)
         make_folder(self.path)
         self._hold()
         write_file(plan_file, text)
@@ -281,23 +316,33 @@ class _WorkFolder:
         """Record that a view is written."""
         write_file(self._record(record.name), _json(asdict(record)))
 
-    def finish(self, overwrite: bool) -> None:
-        """Give the scene its name; the record of how it was made stays in it. RunError where it can't be moved."""
+    def finish(self, overwrite: bool) -> list[str]:
+        """Give the scene its name; the record of how it was made stays in it.
+
+        Returns:
+            What of an earlier scene is still there, in words.
+        Raises:
+            ConfigError: files that are not ours came into the earlier scene meanwhile.
+            RunError: it can't be moved.
+        """
+        earlier = None
         with write_errors_as(self.output):
             if self._lock is not None:
                 self._lock.release()
-            (self.path / _LOCK).unlink(missing_ok=True)
-            old = self.output.with_name(f"{self.output.name}.old")
             if overwrite and self.output.exists():
-                self.output.rename(old)
+                refuse_folder(self.output)
+                earlier = move_aside(self.output, "replaced")
             elif self.output.exists():
                 self.output.rmdir()  # empty, see refuse_output
             self.path.rename(self.output)
             # After a kill here, the scene is whole and has some files too many.
-            for name in (_VIEWS, _POSES):
-                shutil.rmtree(self.output / name, ignore_errors=True)
-            (self.output / _PLAN).unlink()
-            shutil.rmtree(old, ignore_errors=True)
+            remove_folder(self.output / _VIEWS)
+            remove_folder(self.output / _POSES, WORK_FILES)
+            remove(self.output / _PLAN)
+            (self.output / _LOCK).unlink(missing_ok=True)
+            if earlier is not None and remove_folder(earlier):
+                return [f"{earlier} keeps files of the earlier scene that unmix-process did not write"]
+        return []
 
     def _record(self, name: str) -> Path:
         return self.path / _VIEWS / f"{name}.json"
@@ -316,6 +361,7 @@ def _refuse_output(output: Path, overwrite: bool) -> None:
         raise ConfigError(f"{output} is not empty; give a new folder with --output-dir")
     if not overwrite:
         raise ConfigError(f"{output} holds a scene already; replace it with --overwrite, or choose another")
+    refuse_folder(output.resolve())
 
 
 def _json(value: Any) -> bytes:

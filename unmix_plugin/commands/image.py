@@ -53,6 +53,7 @@ def image(argv: list[str]) -> None:
 
     from unmix_plugin.captures.calibration.references import find_missing, own_dark_mean, stated_values
     from unmix_plugin.captures.readers.opening import open_spectral_file
+    from unmix_plugin.engine.runs.replacing import remove
     from unmix_plugin.formats.files import NOT_PORTABLE, refuse_to_overwrite, safe_name
     from unmix_plugin.products.unmixed_image import unmixed_image_paths, write_unmixed_image
     from unmix_plugin.spectral.unmixing.image import unmix_image
@@ -81,8 +82,7 @@ def image(argv: list[str]) -> None:
     fractions = _fractions(cube, mask, options.mnf)
     found = unmix_image(cube, options.endmembers, mask=mask, shares=options.shares, seed=options.seed)
     place = opened.metadata.get("map")
-    for earlier in {*all_paths} - {*paths}:
-        earlier.unlink(missing_ok=True)  # it would tell of other materials
+    remove(*({*all_paths} - {*paths}))  # they would tell of other materials
     names = write_unmixed_image(folder, found, wavelengths, bands + 1, place, library, fractions)
     _say(found, mask, names)
     for path in paths:

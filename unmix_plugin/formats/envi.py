@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from unmix_plugin.engine.runs.atomic_files import write_errors_as, write_file
+from unmix_plugin.engine.runs.replacing import refuse_foreign, remove
 from unmix_plugin.formats.files import RowSink, raw_rows
 from unmix_plugin.limits import MOST_TEXT_BYTES, read_bounded
 from unmix_plugin.spectral.bands import Bands
@@ -371,7 +372,8 @@ def _rows(
     with raw_rows(data_path, b"", shape, np.dtype("<f4")) as add:
         yield add
         with write_errors_as(header_path):
-            header_path.unlink(missing_ok=True)
+            refuse_foreign([data_path, header_path])
+            remove(header_path)
     write_file(header_path, header_bytes(entries))
 
 

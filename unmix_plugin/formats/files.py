@@ -25,6 +25,7 @@ from unmix_plugin.engine.runs.atomic_files import (  # noqa: F401 - some of them
     write_errors_as,
     write_file,
 )
+from unmix_plugin.engine.runs.replacing import refuse_foreign
 from unmix_plugin.engine.tables import csv_bytes  # noqa: F401 - for others, who take it from here
 from unmix_plugin.errors import ConfigError
 
@@ -41,11 +42,13 @@ def refuse_to_overwrite(paths: Collection[Path], overwrite: bool) -> None:
 
     Raises:
         ConfigError: one of `paths` exists, and overwriting was not asked for.
+        RunError: one of them is not ours (`engine.runs.replacing`), be overwriting asked for or not.
     """
-    existing = [path for path in paths if path.exists()]
+    existing = [path for path in paths if os.path.lexists(path)]
     if existing and not overwrite:
         others = f" and {len(existing) - 1} more of its files exist" if len(existing) > 1 else " exists"
         raise ConfigError(f"{existing[0]}{others} already; give --overwrite or another folder")
+    refuse_foreign(paths)
 
 
 def numbered_apart(names: Iterable[str]) -> list[str]:

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from unmix_plugin.engine.runs.replacing import remove
 from unmix_plugin.errors import ConfigError, counted
 from unmix_plugin.figures.pictures import one_above_the_other
 from unmix_plugin.formats.files import csv_bytes, write_file
@@ -115,9 +116,8 @@ def compare_runs(runs: Sequence[ComparedRun], folder: Path) -> Comparison:
 def _write_pictures(
     runs: Sequence[ComparedRun], names: Sequence[str], labels: Sequence[str], folder: Path
 ) -> int:
-    """Pictures that all runs have, one above the other, in place of earlier ones; and how many there are."""
-    for earlier in folder.glob("*/*.png"):
-        earlier.unlink()
+    """Pictures that all runs have, one above the other, in place of earlier ones of ours; and how many there are."""
+    remove(*folder.glob("*/*.png"))
     drawn = 0
     for kind in sorted({path.parent.name for path in runs[0].pictures.glob("*/*.png")}):
         for name in names:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float64, Shaped
 
+from unmix_plugin.engine.runs.replacing import remove
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.figures.plotting import figure_bytes, plain_axes, plot_text
 from unmix_plugin.formats.envi import envi_library_paths, write_envi_library
@@ -36,7 +37,7 @@ def export(job: Job, asked: Endmembers) -> list[Path]:
         job.claim([*paths, angles_path])
         job.say("without angles.csv: known spectra are compared in the run's own bands, without --sensor")
         _write_endmembers(job.folder, materials)
-        angles_path.unlink(missing_ok=True)  # of an earlier export, to spectra in other bands
+        remove(angles_path)  # of an earlier export, to spectra in other bands
         return paths
     light = job.scene.light_power
     known = library_of(asked.library, materials.bands, light)

@@ -17,7 +17,7 @@ _FORMATS = {".npy": "npy", ".png": "png", ".exr": "exr", ".hdr": "envi"}
 
 
 def save(view: MaterialView, name: str, path: str | Path, *, label: str = "") -> Path:
-    """Write an output of a view; a file that is there is replaced.
+    """Write an output of a view, in place of an earlier one of ours; files of others are never replaced.
 
     Args:
         view: As `TrainedScene.look` gives it.
@@ -30,7 +30,7 @@ def save(view: MaterialView, name: str, path: str | Path, *, label: str = "") ->
     Raises:
         ConfigError: an unknown output or suffix, or an output that can't be written that way.
         SpectrumError: the bands don't cover what the output needs.
-        RunError: the disk is full or refuses.
+        RunError: the disk is full or refuses, or a file is there that we did not write, or that was changed since.
     """
     path = Path(path)
     if path.suffix not in _FORMATS:

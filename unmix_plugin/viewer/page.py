@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from jaxtyping import Float
 
+from unmix_plugin.engine.runs.replacing import claim
 from unmix_plugin.errors import ConfigError, UnmixError
 from unmix_plugin.figures.plotting import css_colour
-from unmix_plugin.formats.files import safe_name
+from unmix_plugin.formats.files import make_folder, safe_name, write_errors_as
 
 if TYPE_CHECKING:
     import viser
@@ -67,14 +68,17 @@ def text(value: Any) -> str:
 
 
 def new_file(folder: Path, name: Any, suffix: str, fallback: str) -> Path:
-    """A path directly in `folder` that no file has, named as asked as far as that is safe: anything but letters,
-    digits, `_`, `+`, `-` and inner dots becomes `_`, and where nothing is left the name is `fallback`. A ConfigError if
-    there are too many files of that name."""
+    """A path directly in `folder`, which is made, that no file had, and no other page gets: an empty file claims it. It
+    is named as asked as far as that is safe: anything but letters, digits, `_`, `+`, `-` and inner dots becomes `_`,
+    and where nothing is left the name is `fallback`. A ConfigError if there are too many files of that name, a RunError
+    if the folder can't be written."""
+    make_folder(folder)
     stem = safe_name(text(name).strip().removesuffix(suffix).strip("._/\\"), fallback=fallback)
     for count in range(1, 10_000):
         path = folder / f"{stem if count == 1 else f'{stem}-{count}'}{suffix}"
-        if not path.exists():
-            return path
+        with write_errors_as(path):
+            if claim(path):
+                return path
     raise ConfigError(f"too many files named {stem} in {folder}; choose another name")
 
 

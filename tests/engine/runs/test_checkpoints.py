@@ -116,7 +116,7 @@ def test_a_kill_at_any_system_call_leaves_a_complete_checkpoint(tmp_path, same_s
         assert torch.equal(found.tensors["a"], tensors_of(found.step)["a"])
         seen.add(found.step)
         save_checkpoint(folder, 3, tensors_of(3), {}, keep=1)
-        assert {path.name for path in folder.iterdir()} == {"step-000003.json", "step-000003.safetensors"}
+        assert {path.name for path in folder.glob("[!.]*")} == {"step-000003.json", "step-000003.safetensors"}
     assert seen == ({2} if same_step else {1, 2})
 
 
@@ -195,7 +195,7 @@ def test_the_newest_two_stay_and_a_damaged_one_does_not_count_among_them(tmp_pat
     for step in (10, 999_999, 1_000_000, 1_000_001):
         save_checkpoint(tmp_path / "many", step, tensors_of(step), {})
     assert checkpoint_steps(tmp_path / "many") == [1_000_001, 1_000_000]
-    assert len(list((tmp_path / "many").iterdir())) == 4
+    assert len(list((tmp_path / "many").glob("[!.]*"))) == 4
     for step in (1, 2, 9):
         save_checkpoint(tmp_path, step, tensors_of(step), {}, keep=3)
     (tmp_path / "step-000009.safetensors").write_bytes(b"damaged")

@@ -222,6 +222,6 @@ def test_a_full_disk_while_saving_ends_training_with_its_last_checkpoint(short_c
     with pytest.raises(RunError, match=r"No space left on device.*go on with --load-run"):
         trainer.train()
     assert saved == [4]
-    names = sorted(path.name for path in trainer.run.checkpoints.iterdir())
+    names = sorted(path.name for path in trainer.run.checkpoints.glob("[!.]*"))
     assert names == ["step-000004.json", "step-000004.safetensors"]
     assert "failed at step 8: RunError" in trainer.run.log_path.read_text()

@@ -29,7 +29,7 @@ def written(tmp_path_factory):
     paths, error = write_material(folder, knot(), PBR, FRAME, 256)
     assert error == 0
     assert sorted(paths) == sorted(material_paths(folder, PBR.family))
-    assert sorted(paths) == sorted(path for path in folder.rglob("*") if path.is_file())
+    assert sorted(paths) == sorted(path for path in folder.rglob("[!.]*") if path.is_file())
     return folder
 
 

@@ -182,7 +182,7 @@ def test_the_material_is_exported_with_its_decoder_and_mixtures_are_not(neural, 
     scene = load_run(neural, "cpu").scene
     assert isinstance(scene, TrainedObject)
     expected = set(material_paths(tmp_path, scene.surface.family))
-    assert {path for path in tmp_path.rglob("*") if path.is_file()} == expected
+    assert {path for path in tmp_path.rglob("[!.]*") if path.is_file()} == expected
     assert {"decoder.glsl", "latents_a.png", "latents_b.exr"} <= {path.name for path in expected}
     assert "--overwrite" in refused(export, *words)
     assert "choose 16 to 8192" in refused(export, *words, "--overwrite", "--texture-size", 3)

@@ -13,6 +13,7 @@ import hashlib
 import importlib.util
 import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
@@ -54,6 +55,11 @@ _GAIN = 0.02
 _GREATEST_BEND = 0.1
 """Of half the diagonal: what distortion may move the corner of a picture by."""
 _LOG, _RESULT, _REPORT, _DRAWN = "colmap.log", "found.json", "report.txt", "worst-matches.png"
+WORK_FILES = re.compile(
+    r"(images|masks)/\d{6,}\.png(\.png)?|database\.db(-wal|-shm|-journal)?|matched\.txt|settings\.json|colmap\.log|"
+    r"found\.json|report\.txt|worst-matches\.png|models/[^/]+/(\d+/)?\w+\.(bin|txt|ini)"
+)
+"""Names of the files that an estimation leaves in its folder."""
 _FEW_FEATURES, _FEW_MATCHES = 400, 60
 """Of a view, and with the view that shares most with it, below which these are what is missing."""
 _STILL_PX, _MOSTLY_STILL = 1.5, 0.5

@@ -9,21 +9,25 @@ import hashlib
 import json
 import os
 import re
-import time
 import unicodedata
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from unmix_plugin.engine.runs.replacing import (
+    drop_claim,
+    hash_of,
+    is_ours,
+    list_file,
+    put_in_place,
+    temporary_name,
+)
 from unmix_plugin.errors import RunError
 from unmix_plugin.limits import DEEPEST, MOST_TABLE_BYTES, parse_json, read_bounded
 
 _CHUNK_BYTES = 1 << 26
 """Bytes handed to one write."""
-
-_READERS_S = (0.02, 0.1, 0.5, 1.0) if os.name == "nt" else ()
-"""Waits for readers of a file to be replaced: Windows lets nobody replace one that is open, as by a virus scanner."""
 
 _LONGEST_PATH = 259 if os.name == "nt" else None
 """Letters of a path, where Windows has not been told to take long ones; its error is that of a missing folder."""
@@ -71,26 +75,28 @@ def safe_name(name: str, unfit: str = NOT_PLAIN, fallback: str = "unnamed") -> s
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Context that gives a temporary name in the folder of `path`, which is made; nothing has that name yet, nor does
-    another process that writes the same file take it.
+    """Context that gives a temporary name in the folder of `path`, which is made; no other writer has that name, be it
+    another thread that writes the same file.
 
-    At the end of the block the file under that name is forced to disk and becomes `path`. If the block fails, nothing
-    is left of it and `path` is as it was.
+    At the end of the block the file under that name is forced to disk and becomes `path`, unless something is there
+    that is not ours (`replacing`). If the block fails, nothing is left of it and `path` is as it was.
 
     Raises:
         RunError: the folder can't be made, or the file can't get its name.
     """
     make_folder(path.parent)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = temporary_name(path)
     try:
-        with write_errors_as(path):
-            temporary.unlink(missing_ok=True)  # a link that lies there would lead the writer elsewhere
         yield temporary
         with write_errors_as(path):
             _sync(temporary, os.O_RDWR)
-            _replace(temporary, path)
+            put_in_place(temporary, path)
             if os.name != "nt":  # Windows can't sync a folder, and needn't
                 _sync(path.parent, os.O_RDONLY)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            drop_claim(path)
+        raise
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
@@ -149,22 +155,6 @@ def _too_long(path: Path) -> str:
     return f"; the path has more than {_LONGEST_PATH} letters: choose a shorter folder, or turn on long paths"
 
 
-def remove_stale_temporaries(folder: Path) -> None:
-    """Remove what writers that were killed left behind in `folder`."""
-    for path in folder.glob(".*.tmp"):
-        path.unlink(missing_ok=True)
-
-
-def _replace(temporary: Path, path: Path) -> None:
-    """Give a file its name, also where somebody who reads the old one has to be waited for."""
-    for seconds in _READERS_S:
-        with contextlib.suppress(PermissionError):
-            temporary.replace(path)
-            return
-        time.sleep(seconds)
-    temporary.replace(path)
-
-
 def _sync(path: Path, flags: int) -> None:
     descriptor = os.open(path, flags)
     try:
@@ -186,14 +176,25 @@ class OtherFormatError(RunError):
 
 
 def write_run_json(path: Path, values: dict[str, Any]) -> None:
-    """Write `values` and the format version as readable JSON, whole or not at all.
+    """Write `values` and the format version as readable JSON, whole or not at all, in place of a file of a run, be it
+    from before lists of files were kept, or edited by hand, which the caller has read.
 
     Raises:
-        RunError: the disk is full or refuses.
+        RunError: the disk is full or refuses, or a file is there that no run wrote.
         TypeError, ValueError: a value that JSON has no form for, or a number that is not finite.
     """
     text = json.dumps({"format_version": RUN_FORMAT, **values}, indent=1, allow_nan=False)
+    with write_errors_as(path):
+        adopt_run_json(path)
     write_file(path, (text + "\n").encode())
+
+
+def adopt_run_json(path: Path) -> None:
+    """Make a file that reads as one of a run one that may be replaced and removed. Raises OSError."""
+    if os.path.lexists(path) and not is_ours(path):
+        with contextlib.suppress(RunError):
+            read_run_json(path)
+            list_file(path, hash_of(path))
 
 
 def read_run_json(path: Path) -> dict[str, Any]:

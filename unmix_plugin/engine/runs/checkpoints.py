@@ -6,6 +6,7 @@ only if the tensors' SHA-256 is the record's. The tensors are those of parameter
 
 import hashlib
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -18,12 +19,19 @@ from torch import Tensor, nn
 from unmix_plugin.engine.configs import require_in_range
 from unmix_plugin.engine.runs.atomic_files import (
     OtherFormatError,
+    adopt_run_json,
     read_run_json,
-    remove_stale_temporaries,
     write_file,
     write_run_json,
 )
 from unmix_plugin.engine.runs.config_json import config_from_json
+from unmix_plugin.engine.runs.replacing import (
+    hash_of,
+    list_file,
+    move_aside,
+    remove,
+    remove_stale_temporaries,
+)
 from unmix_plugin.engine.runs.run_folder import checkpoint_steps
 from unmix_plugin.engine.training.optimizers import ParameterAverage
 from unmix_plugin.errors import ConfigError, RunError
@@ -70,7 +78,7 @@ def save_checkpoint(
         _remove_orphans(folder)
         is_there = record_path.exists() and tensors_path.exists()
         if not is_there or hashlib.sha256(tensors_path.read_bytes()).hexdigest() != sha256:
-            record_path.unlink(missing_ok=True)  # of a damaged one: never a record beside other tensors
+            _remove(record_path, tensors_path)  # of a damaged one: never a record beside other tensors
             write_file(tensors_path, data)
         write_run_json(record_path, {**record, "step": step, "sha256": sha256})
         _remove_others(folder, step, keep)
@@ -153,7 +161,7 @@ def _remove_orphans(folder: Path) -> None:
     """Remove tensors without a record: their writer was stopped before the checkpoint was one."""
     for path in folder.glob("step-*.safetensors"):
         if not path.with_suffix(".json").exists():
-            path.unlink(missing_ok=True)
+            remove(path)
 
 
 def _remove_others(folder: Path, step: int, keep: int) -> None:
@@ -161,8 +169,20 @@ def _remove_others(folder: Path, step: int, keep: int) -> None:
     steps = checkpoint_steps(folder)
     kept = [other for other in steps if other <= step][:keep]
     for other in set(steps) - set(kept):
-        (folder / f"{_stem(other)}.json").unlink(missing_ok=True)  # the record first: never a record alone
-        (folder / f"{_stem(other)}.safetensors").unlink(missing_ok=True)
+        _remove(folder / f"{_stem(other)}.json", folder / f"{_stem(other)}.safetensors")
+
+
+def _remove(record_path: Path, tensors_path: Path) -> None:
+    """Remove a checkpoint, the record first: there is never a record without its tensors. What is damaged, or not ours,
+    gets another name."""
+    if record_path.is_file() and tensors_path.is_file():
+        with suppress(RunError):
+            if hash_of(tensors_path) == read_run_json(record_path).get("sha256"):
+                list_file(tensors_path, hash_of(tensors_path))
+    adopt_run_json(record_path)
+    for path in (record_path, tensors_path):
+        for other in remove(path):
+            move_aside(other, "damaged")
 
 
 @dataclass(frozen=True)

@@ -122,15 +122,18 @@ def checkpoint_steps(folder: Path) -> list[int]:
 
 
 def _refuse_links_out(root: Path) -> None:
-    """Whoever made the folder must not choose which other files get written."""
-    for folder, folders, files in os.walk(root):
-        for name in (*folders, *files):
-            path = Path(folder, name)
-            if path.is_symlink() and not path.resolve().is_relative_to(root):
-                raise RunError(
-                    f"{path} is a link that leads out of the run folder, to {path.resolve()}; "
-                    "put what it leads to in its place, or remove it"
-                )
+    """Whoever made the folder must not choose which other files get written. `exports` may be a folder elsewhere, as on
+    a larger disk: no file of others is replaced there."""
+    exports = root / "exports"
+    allowed = {exports} if exports.is_symlink() and exports.is_dir() else set()
+    for top in (root, *(path.resolve() for path in allowed)):
+        for folder, folders, files in os.walk(top):
+            for path in (Path(folder, name) for name in (*folders, *files)):
+                if path.is_symlink() and not path.resolve().is_relative_to(top) and path not in allowed:
+                    raise RunError(
+                        f"{path} is a link that leads out of the run folder, to {path.resolve()}; "
+                        "put what it leads to in its place, or remove it"
+                    )
 
 
 class RunLock:

@@ -22,6 +22,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
 from unmix_plugin.engine.runs.atomic_files import cannot_write, parse_plain_json, write_file
+from unmix_plugin.engine.runs.replacing import hash_of, list_file, move_aside
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.limits import MOST_TABLE_BYTES, read_bounded, regular_file
@@ -237,11 +238,18 @@ def _record(line: bytes) -> dict[str, Any] | None:
 
 
 def _keep_until(path: Path, step: int) -> None:
-    """Rewrite a JSON-lines file without later steps' lines and without one cut off by a kill."""
+    """Rewrite a JSON-lines file without later steps' lines and without one cut off by a kill. One with lines that no
+    run writes gets another name."""
     if not path.exists():
         return
-    records = [(line, _record(line)) for line in _lines(path)]
-    kept = [line for line, record in records if record is not None and record["step"] <= step]
+    lines = _lines(path)
+    records = [_record(line) for line in lines]
+    if None in records[:-1]:
+        move_aside(path, "damaged")
+    else:
+        list_file(path, hash_of(path))  # lines were appended since it was listed, if it ever was
+    pairs = zip(lines, records, strict=True)
+    kept = [line for line, record in pairs if record is not None and record["step"] <= step]
     write_file(path, b"".join(line + b"\n" for line in kept))
 
 

@@ -13,7 +13,7 @@ from unmix_plugin.engine.configs import TrainerConfig, refuse_changes_at_start
 from unmix_plugin.engine.machine import keep_freed_memory
 from unmix_plugin.engine.processes import ALONE, Processes
 from unmix_plugin.engine.registry import discover_methods
-from unmix_plugin.engine.runs.atomic_files import write_run_json
+from unmix_plugin.engine.runs.atomic_files import adopt_run_json, write_run_json
 from unmix_plugin.engine.runs.checkpoints import (
     AVERAGE,
     TrainingRecord,
@@ -25,6 +25,7 @@ from unmix_plugin.engine.runs.checkpoints import (
 )
 from unmix_plugin.engine.runs.config_json import require_kept
 from unmix_plugin.engine.runs.load_run import load_config, require_data, write_config
+from unmix_plugin.engine.runs.replacing import remove
 from unmix_plugin.engine.runs.run_folder import (
     RunFolder,
     RunLock,
@@ -135,7 +136,8 @@ class Trainer:
             with self.control.device.training_turn():
                 self.warm_up()
             self.steps.begin(self.step)
-            self.run.training_path.unlink(missing_ok=True)  # of the training that this one goes on with
+            adopt_run_json(self.run.training_path)
+            remove(self.run.training_path)  # of the training that this one goes on with
             with stop_signals() as signals, ProgressDisplay(self.console) as display, self.control.running():
                 self._loop(signals, display)
         except KeyboardInterrupt as error:

@@ -26,6 +26,7 @@ from jaxtyping import Float, Float32, UInt8
 
 from unmix_plugin.engine.geometry.camera_paths import upright_cameras
 from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.runs.replacing import move_aside, move_files, refuse_foreign
 from unmix_plugin.errors import ConfigError, SceneError
 from unmix_plugin.scenes.demo.shading import (
     LAMP,
@@ -74,11 +75,13 @@ def check_bounds(what: str, numbers: Mapping[str, tuple[int, tuple[int, int]]]) 
 
 
 @contextmanager
-def staging_for(directory: Path, what: str, overwrite: bool) -> Iterator[Path]:
-    """A temporary folder in which to build what then moves to `directory`, which messages call `what`.
+def staging_for(directory: Path, what: str, overwrite: bool, last: str) -> Iterator[Path]:
+    """A temporary folder in which to build what then moves to `directory`, which messages call `what`; `last` is the
+    file of it without which it is none.
 
     Raises:
         ConfigError: a folder with something in it that is not to be overwritten, or no folder at all.
+        RunError: the folder has a file of others that is called `last`.
         SceneError: the folder can't be written, or the disk is full.
     """
     if directory.exists() and not directory.is_dir():
@@ -88,6 +91,9 @@ def staging_for(directory: Path, what: str, overwrite: bool) -> Iterator[Path]:
             f"{directory} is not empty; choose another folder, or replace what is there with --overwrite"
         )
     try:
+        refuse_foreign(
+            [directory / last]
+        )  # before minutes are spent; files of other names when they are moved
         with _staging_beside(directory) as staging:
             yield staging
     except OSError as error:  # NumPy's own has no strerror
@@ -119,7 +125,7 @@ def written_once(
         with _staging_beside(target) as staging:
             write(staging / target.name)
             if target.exists() and not is_complete(target):
-                target.rename(staging / "incomplete")
+                move_aside(target, "incomplete")
             (staging / target.name).rename(target)
     except OSError as error:
         # Another process may have been quicker; what it wrote is as good.
@@ -335,15 +341,16 @@ def make_demo_scene(
     Raises:
         ConfigError: a number out of bounds; a folder with something in it, or no folder at all.
         SpectrumError: an unknown light, or one that is not known at all bands.
+        RunError: a file of others has a name that the scene needs; nothing was moved.
         SceneError: the folder can't be written, or the disk is full.
     """
     check_bounds(
         "a demo scene",
         {"size": (size, SIZE_BOUNDS), "bands": (bands, _BANDS_BOUNDS), "views": (views, VIEWS_BOUNDS)},
     )
-    with staging_for(directory, "the demo scene", overwrite) as staging:
+    with staging_for(directory, "the demo scene", overwrite, _TRANSFORMS) as staging:
         _write_scene(staging / "scene", size, bands, views, illuminant, place)
-        _move_files(staging / "scene", directory)
+        move_files(staging / "scene", directory, _TRANSFORMS)
 
 
 def is_complete(directory: Path) -> bool:
@@ -419,20 +426,6 @@ def _write_view(
         entry["abundance_file_path"] = f"abundances/{name}.npy"
         np.save(folder / entry["abundance_file_path"], view.abundances.astype(np.float16))
     return entry
-
-
-def _move_files(built: Path, directory: Path) -> None:
-    """Put a scene into a folder in place of an older one, transforms.json last: a scene is whole or not there."""
-    directory.mkdir(exist_ok=True)
-    (directory / _TRANSFORMS).unlink(missing_ok=True)
-    for folder in _FOLDERS:
-        (directory / folder).mkdir(exist_ok=True)
-        for stale in (*(directory / folder).glob("train_*"), *(directory / folder).glob("eval_*")):
-            stale.unlink()
-    for path in sorted(built.rglob("*")):
-        if path.is_file() and path.name != _TRANSFORMS:
-            path.replace(directory / path.relative_to(built))
-    (built / _TRANSFORMS).replace(directory / _TRANSFORMS)
 
 
 def user_cache() -> Path:

@@ -94,17 +94,21 @@ class CapturePanel:
         settings, maker = self._session.view.settings, self._session.services.maker
         if self._session.value_range_shown is not None:  # strips would each have a scale of their own
             settings = settings.changed("value_range", self._session.value_range_shown)
-        path, what = self._new_file(".png"), f"{settings.layer}, {camera.width} x {camera.height} pixels"
+        name, what = self._name.value, f"{settings.layer}, {camera.width} x {camera.height} pixels"
         self._begin(
             camera,
             lambda strip: (maker.paint(strip, settings, False, False).picture,),
-            lambda picture: write_file(path, rgba_png_bytes(picture[0], what)),
+            lambda picture: write_file(self._new_file(name, ".png"), rgba_png_bytes(picture[0], what)),
         )
 
     def _save_spectra(self) -> None:
         materials = self._session.materials()
-        camera, path = self._camera(len(materials.bands)), self._new_file(".exr")
-        self._begin(camera, strip_of_spectra, lambda picture: write_spectra(path, picture, materials))
+        camera, name = self._camera(len(materials.bands)), self._name.value
+        self._begin(
+            camera,
+            strip_of_spectra,
+            lambda picture: write_spectra(self._new_file(name, ".exr"), picture, materials),
+        )
 
     def _begin(
         self,
@@ -131,8 +135,8 @@ class CapturePanel:
 
         threading.Thread(target=work, name="unmix-viewer-picture", daemon=True).start()
 
-    def _new_file(self, suffix: str) -> Path:
-        return new_file(self._session.services.folder, self._name.value, suffix, "view")
+    def _new_file(self, name: Any, suffix: str) -> Path:
+        return new_file(self._session.services.folder, name, suffix, "view")
 
     def _hand_over(self, path: Path) -> None:
         """Offer a file that was written to the browser as well, if it is not too large."""
