@@ -32,6 +32,9 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 sys.path.append(str(REPOSITORY))  # tools/ is in no wheel
 RESULTS = Path(__file__).resolve().parent / "results"
 
+MADE = ".made"
+"""A file that says that a scene of the cache is whole."""
+
 Verdict: TypeAlias = Literal["aim reached", "pass", "MISS", "not measured", "reported"]
 
 
@@ -149,6 +152,29 @@ def publish(report: Report, results: Path | None) -> None:
 def results_folder(given: Path | None, quick: bool) -> Path | None:
     """Where to write: the given folder, or `results/` beside the benchmarks; nowhere after a quick run."""
     return given if given is not None else None if quick else RESULTS
+
+
+def scenes_folder() -> Path:
+    """Where the path-traced scenes are kept: $UNMIX_BENCHMARK_SCENES, or a folder of the user's cache."""
+    from unmix_plugin.scenes.demo.scene import user_cache
+
+    given = os.environ.get("UNMIX_BENCHMARK_SCENES")
+    return Path(given) if given else user_cache() / "benchmark-scenes"
+
+
+def is_made(folder: Path) -> bool:
+    """Whether `scenes.py` has written all of a scene."""
+    return (folder / MADE).is_file()
+
+
+def scene_folder(name: str) -> Path:
+    """A path-traced scene of the cache. Raises SystemExit, with the command that makes it, if it is missing."""
+    folder = scenes_folder() / name
+    if not is_made(folder):
+        missing = f"the scene {name} has not been made (looked in {scenes_folder()})"
+        print(f"{missing}; make it with: python benchmarks/scenes.py --only {name}", file=sys.stderr)
+        raise SystemExit(2)
+    return folder
 
 
 @dataclass(frozen=True)

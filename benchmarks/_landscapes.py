@@ -62,7 +62,7 @@ def landscape(number: int) -> Landscape:
     wavelengths = np.linspace(*_SENSORS[sensor], num_bands)
     num_materials = int(rng.choice([3, 4, 4, 5, 5, 6, 7, 8, 10, 12]))
     has_twins = bool(rng.random() < 0.25)
-    names, spectra = _materials(rng, wavelengths, num_materials, sensor, has_twins)
+    names, spectra = draw_materials(rng, wavelengths, num_materials, sensor, has_twins)
     layout = str(rng.choice(["smooth", "patches", "edges", "roads"]))
     abundances = _LAYOUTS[layout](rng, num_materials)
     purity = 1.0
@@ -190,7 +190,7 @@ def _paint(rng: np.random.Generator, nm: Array) -> Array:
     return np.clip(seen + beyond * _rise(nm, 790, 20), 0.01, 0.9) * _leaf_water(nm, rng.uniform(0, 0.2))
 
 
-_FAMILIES: dict[str, Callable[[np.random.Generator, Array], Array]] = {
+FAMILIES: dict[str, Callable[[np.random.Generator, Array], Array]] = {
     "plant": _plant,
     "dry plant": _dry_plant,
     "soil": _soil,
@@ -205,18 +205,18 @@ _FAMILIES: dict[str, Callable[[np.random.Generator, Array], Array]] = {
 _COUNTRYSIDE = ("plant", "soil", "water", "asphalt")
 
 
-def _materials(
+def draw_materials(
     rng: np.random.Generator, nm: Array, count: int, sensor: str, has_twins: bool
 ) -> tuple[tuple[str, ...], Array]:
     """Names and spectra (K, B), no two of one shape."""
-    families = list(_FAMILIES)
+    families = list(FAMILIES)
     names: list[str] = list(_COUNTRYSIDE[:count]) if rng.random() < 0.5 and sensor != "visible" else []
     weights = np.array([5.0 if sensor == "visible" and name == "paint" else 1.0 for name in families])
     spectra: list[Array] = []
     while len(spectra) < count:
         is_drawn = len(names) == len(spectra)
         name = str(rng.choice(families, p=weights / weights.sum())) if is_drawn else names[len(spectra)]
-        spectrum = _FAMILIES[name](rng, nm)
+        spectrum = FAMILIES[name](rng, nm)
         if all(_angle(spectrum, other) > _LEAST_ANGLE for other in spectra):
             spectra.append(spectrum)
             names[len(spectra) - 1 : len(spectra)] = [name]
