@@ -272,7 +272,9 @@ class HyperspectralDataManager(DataManager):
         """Where something may be, and what to say of masks that contradict each other; all pixels are read for it."""
         foreground = self._foreground
         hull = self._surfaces.carved(carve(self.scene, self.options.grid_resolution, foreground))
-        if foreground is None or self.scene.is_unbounded:
+        if (
+            foreground is None or self.scene.is_unbounded or self.scene.has_backdrop
+        ):  # which was tried by that
             return hull, None
         return hull, mask_warning(self.scene, foreground)
 

@@ -117,7 +117,7 @@ EVERYWHERE = np.ones((HEIGHT, WIDTH), bool)
 
 def judge(images: list[np.ndarray], known: np.ndarray = EVERYWHERE) -> Backdrop | None:
     sample = np.concatenate([image[::5, ::3].reshape(-1, BANDS) for image in images])
-    return judge_backdrop(images, [known] * len(images), sample)
+    return judge_backdrop([(image, known) for image in images], sample)
 
 
 def seen_in(image: np.ndarray, images: list[np.ndarray], known: np.ndarray = EVERYWHERE) -> Any:

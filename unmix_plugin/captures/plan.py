@@ -364,13 +364,15 @@ def _find_backdrop(
     """The backdrop of a sensor's views, judged by some rows of some of them; the sample is of all, divided by scale."""
     raster = sensor.calibration.raster
     rows = np.unique(np.linspace(0, raster.height - 1, min(raster.height, _ROWS_LOOKED_AT)).astype(int))
-    images, known = [], []
-    for index in np.unique(np.linspace(0, len(views) - 1, min(len(views), _LOOKED_AT)).round().astype(int)):
+    chosen = np.unique(np.linspace(0, len(views) - 1, min(len(views), _LOOKED_AT)).round().astype(int))
+
+    def look(index: int) -> tuple[np.ndarray, np.ndarray]:
         parts = [sensor.calibration.rows(views[index].cube, row, row + 1) for row in rows.tolist()]
         values = np.concatenate([np.where(x.saturated, np.float32(scale), x.values) for x in parts])
-        images.append(np.clip(values / np.float32(scale), 0.0, 1.0))
-        known.append(~np.concatenate([part.missing for part in parts]))
-    return judge_backdrop(images, known, sample)
+        seen = np.clip(values / np.float32(scale), 0.0, 1.0)
+        return seen, ~np.concatenate([part.missing for part in parts])
+
+    return judge_backdrop(map(look, chosen.tolist()), sample)
 
 
 def input_files(view: CaptureView) -> list[Path]:

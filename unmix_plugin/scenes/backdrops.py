@@ -1,15 +1,15 @@
 """A backdrop that is much alike within and over views: whether there is one, and which pixels of a view show it.
 
-In each view a backdrop is one or two smooth surfaces (`border_surfaces`). Stripes of the sensor, the same in all views,
-are taken off first. Rooms and landscapes have borders too. So a backdrop counts only if it is plain, reaches most of
-the border of nearly all views, and looks alike in all of them: a mask that is wrong is worse than none.
+In each view a backdrop is up to three smooth surfaces (`border_surfaces`). Stripes of the sensor, the same in all
+views, are taken off first. Rooms and landscapes have borders too. So a backdrop counts only if it is plain, reaches
+most of the border of nearly all views, and looks alike in all of them: a mask that is wrong is worse than none.
 
 Notation: `H x W` pixels, `B` bands, `k` features of a spectrum; values in [0, 1] as they are written.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -89,8 +89,8 @@ class Backdrop:
         surfaces = [surface for surface in view.surfaces if self._is_like(surface.level)]
         return replace(view, surfaces=surfaces).look() if surfaces else None
 
-    def spectra(self, features: Float32[np.ndarray, "P k"]) -> Float32[np.ndarray, "P B"]:
-        """Spectra of these features."""
+    def spectra(self, features: Float32[np.ndarray, "*P k"]) -> Float32[np.ndarray, "*P B"]:
+        """Spectra of these features, of one pixel or of many."""
         return features @ self.basis.T
 
     def _is_like(self, level: Float32[np.ndarray, " k"]) -> bool:
@@ -124,6 +124,8 @@ class BeforeBackdrop:
     stride: int
     size: tuple[int, int]
     """Width and height of a view."""
+    in_words: str
+    """Colour and brightness of the backdrop."""
 
     @property
     def shows_matter(self) -> bool:
@@ -149,16 +151,16 @@ def find_before_backdrop(views: Views) -> BeforeBackdrop | None:
         image = views.read(view, part)
         return image, np.ones(image.shape[:2], bool) if views.valid is None else views.valid(view)[part[:2]]
 
-    images, known = zip(*(read(view) for view in np.unique(chosen).tolist()), strict=True)
-    sample = [image[::4, ::4][mask[::4, ::4]] for image, mask in zip(images, known, strict=True)]
-    backdrop = judge_backdrop(images, known, np.concatenate(sample))
+    looked_at = np.unique(chosen).tolist()
+    sample = [image[::4, ::4][mask[::4, ::4]] for image, mask in map(read, looked_at)]
+    backdrop = judge_backdrop(map(read, looked_at), np.concatenate(sample))
     if backdrop is None:
         return None
     masks = []
     for image, mask in (read(view) for view in range(count)):
         seen = backdrop.find(backdrop.features(image), mask)
         masks.append(np.ones_like(mask) if seen is None else _without_specks(~seen.shown) | ~mask)
-    return BeforeBackdrop(tuple(masks), stride, size)
+    return BeforeBackdrop(tuple(masks), stride, size, backdrop.in_words)
 
 
 def _without_specks(matter: Mask) -> Mask:
@@ -172,19 +174,25 @@ def _without_specks(matter: Mask) -> Mask:
 
 
 def judge_backdrop(
-    images: Sequence[Float32[np.ndarray, "h W B"]],
-    known: Sequence[Bool[np.ndarray, "h W"]],
+    views: Iterable[tuple[Float32[np.ndarray, "h W B"], Bool[np.ndarray, "h W"]]],
     sample: Float32[np.ndarray, "N B"],
 ) -> Backdrop | None:
-    """The backdrop of some views, given their pixels or some of their rows, which of these have a measurement, and a
-    sample of pixels of all views."""
-    if min(images[0].shape[:2]) < 3 or len(sample) < _NUM_FEATURES:
+    """The backdrop of some views; None without one.
+
+    Args:
+        views: Pixels of each, or some of their rows, and which of these have a measurement; asked for once, one after
+            the other, so that few bands of few views are in memory.
+        sample: Pixels of all views.
+    """
+    if len(sample) < _NUM_FEATURES:
         return None
     basis = _basis(np.clip(sample, 0.0, 1.0))
     brightest = float(np.percentile(norm(np.clip(sample, 0.0, 1.0)), _BRIGHT_PERCENTILE))
     if brightest <= 0:
         return None
-    features = [image @ basis for image in images]
+    features, known = zip(*((np.asarray(image @ basis), mask) for image, mask in views), strict=True)
+    if min(features[0].shape[:2]) < 3:
+        return None
     stripes = _stripes(features)
     fitted = [
         fit_surfaces(image - stripes, mask, brightest) for image, mask in zip(features, known, strict=True)
@@ -198,12 +206,12 @@ def judge_backdrop(
     near = norm(levels[:, None] - levels[None]) < _MOST_UNLIKE * brightest
     has_corner = np.array([has for view in fitted for has in view.have_corners()])
     supported = [
-        len(set(owners[row])) >= _MOST_VIEWS * len(images) and has_corner[row].mean() >= _LEAST_CORNERS
+        len(set(owners[row])) >= _MOST_VIEWS * len(fitted) and has_corner[row].mean() >= _LEAST_CORNERS
         for row in near
     ]
     found = Backdrop(basis, stripes, brightest, levels[supported], np.zeros(basis.shape[0], np.float32))
-    explained, shares, distances, spectra = [], [], [], []
-    for image, view, mask in zip(images, fitted, known, strict=True):
+    explained, shares, distances, levels_shown = [], [], [], []
+    for view, mask in zip(fitted, known, strict=True):
         seen = found._look(view)
         shown = np.zeros_like(mask) if seen is None else seen.shown
         at_border = border_of(mask.shape) & mask
@@ -211,7 +219,7 @@ def judge_backdrop(
         shares.append(shown[mask].mean() if mask.any() else 0.0)
         if seen is not None and shown.any():
             distances.append(np.median(norm(seen.features - seen.behind)[shown]) / brightest)
-            spectra.append(np.median(image[shown], axis=0))
+            levels_shown.append(np.median(seen.features[shown], axis=0))
     if (
         not distances
         or np.median(explained) < _LEAST_EXPLAINED
@@ -221,7 +229,8 @@ def judge_backdrop(
         or np.median(distances) > _MOST_DISTANCE
     ):
         return None
-    return replace(found, spectrum=np.median(spectra, axis=0).astype(np.float32))
+    spectrum = found.spectra(np.median(levels_shown, axis=0).astype(np.float32))
+    return replace(found, spectrum=spectrum.clip(min=0))
 
 
 def _basis(sample: Float32[np.ndarray, "N B"]) -> Float32[np.ndarray, "B k"]:

@@ -10,6 +10,7 @@ Notation: `H x W` pixels, `k` features of a spectrum, `t` terms of a surface, `P
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,8 @@ Mask = Bool[np.ndarray, "H W"]
 Distances = Float32[np.ndarray, "H W"]
 BORDER_SHARE = 0.02
 """Width of the border, as a share of the view's."""
-_MOST_SURFACES = 2
+_MOST_SURFACES = 3
+"""In one view: a floor and the two walls of a corner."""
 _NUM_TERMS = 10
 TURNS = 5
 """In which surfaces grow from the border inwards."""
@@ -109,8 +111,8 @@ class FittedView:
             values: Of the surfaces; what is a mixture of two is alike, too.
         """
         alike = (distance <= 1) & self.known
-        if len(values) > 1:
-            alike |= self._seam(*values)
+        for first, second in combinations(range(len(values)), 2):
+            alike |= self._seam(first, second, values)
         parts = parts_of(alike)
         kept = np.bincount(parts.ravel()) >= max(4.0, HOLE_SHARE * alike.size)
         for part in np.flatnonzero(kept).tolist():
@@ -119,17 +121,20 @@ class FittedView:
         kept[0] = False
         return kept[parts]
 
-    def _seam(self, first: Features, second: Features) -> Mask:
+    def _seam(self, first: int, second: int, values: list[Features]) -> Mask:
         """Pixels between two surfaces that are mixtures of both."""
         from scipy import ndimage
 
         near = [
-            ndimage.binary_dilation(norm(self.features - values) <= each.tolerance, iterations=_RIM_PX)
-            for values, each in zip((first, second), self.surfaces, strict=True)
+            ndimage.binary_dilation(
+                norm(self.features - values[each]) <= self.surfaces[each].tolerance, iterations=_RIM_PX
+            )
+            for each in (first, second)
         ]
-        across, most = second - first, max(each.tolerance for each in self.surfaces)
-        share = ((self.features - first) * across).sum(-1) / np.maximum((across**2).sum(-1), 1e-12)
-        away = norm(self.features - first - np.clip(share, 0, 1)[..., None] * across)
+        across, most = values[second] - values[first], max(each.tolerance for each in self.surfaces)
+        from_first = self.features - values[first]
+        share = (from_first * across).sum(-1) / np.maximum((across**2).sum(-1), 1e-12)
+        away = norm(from_first - np.clip(share, 0, 1)[..., None] * across)
         return np.logical_and(near[0], near[1]) & self.known & (away <= most)
 
 
@@ -172,7 +177,7 @@ class LookedAt:
 
 
 def fit_surfaces(features: Features, known: Mask, brightest: float) -> FittedView:
-    """Up to two smooth surfaces that explain most of a view's border, grown inwards from there."""
+    """Up to three smooth surfaces that explain most of a view's border, grown inwards from there."""
     stride = max(1, round((known.size / _MOST_FITTED) ** 0.5))
     thin = (slice(None, None, stride),) * 2
     is_known = known[thin]

@@ -16,6 +16,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Shaped, UInt8
 
+from unmix_plugin.engine.decisions import Decision
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.engine.runs.config_json import config_from_json
@@ -105,6 +106,8 @@ class Scene:
     """How the scene was read."""
     fwhm_nm: Float64[np.ndarray, " B"] | None = None
     """Widths of the instrument's bands; None where they are unknown."""
+    decisions: tuple[Decision, ...] = ()
+    """What was concluded from the views when the scene was read."""
 
     @property
     def has_backdrop(self) -> bool:

@@ -20,6 +20,7 @@ import torch
 from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
+from unmix_plugin.engine.decisions import UNDECIDED, Decision
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
 from unmix_plugin.errors import counted
@@ -315,6 +316,25 @@ class _WorldEvidence:
             return f"the world is taken to go on behind the scene box: {why} (--world bounded if not)"
         known = ", ".join(text for _, text in self._reasons)
         return f"the scene is taken to end with its box: {known} (--world unbounded if not)"
+
+    @property
+    def decision(self) -> Decision:
+        """The same with its numbers."""
+        return Decision(
+            "world",
+            UNDECIDED if not self.num_pixels else "unbounded" if self.goes_on else "bounded",
+            {
+                "pixels that show places behind the box": self.num_behind,
+                "pixels that show places in it": self.num_inside,
+                "pixels asked": self.num_pixels,
+                "explained by its inside": self.num_explained,
+                "matched places": self.num_places,
+                "matched places outside": self.num_outside,
+            },
+            f"more than {_MOST_BEHIND:.0%} of pixels or places behind the box, or its inside explains less than "
+            f"{_LEAST_EXPLAINED:.0%}",
+            "--world",
+        )
 
     @property
     def _reasons(self) -> list[tuple[bool, str]]:

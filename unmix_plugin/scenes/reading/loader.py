@@ -171,6 +171,7 @@ def _assemble(
         is_unbounded=space.is_unbounded,
         before_backdrop=before,
         world_reason=space.world_reason,
+        decisions=space.decisions,
         warnings=warnings,
         has_labels=all("seg_file_path" in files for files in evaluated),
         has_abundances=all("abundance_file_path" in files for files in evaluated),

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32, Float64
 
+from unmix_plugin.engine.decisions import Decision
 from unmix_plugin.engine.geometry.camera_paths import meeting_point
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import KeyPoses
@@ -18,6 +19,7 @@ from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes.backdrops import BeforeBackdrop, find_before_backdrop
 from unmix_plugin.scenes.geometry.bounds import find_bounds
+from unmix_plugin.scenes.geometry.carving import MOST_CONTRADICTED, share_contradicted
 from unmix_plugin.scenes.geometry.matched_points import find_matched_points
 from unmix_plugin.scenes.geometry.view_agreement import compare_conventions, describe, find_world_evidence
 from unmix_plugin.scenes.geometry.views import Views, commonest
@@ -116,6 +118,45 @@ class ModelSpace:
     is_unbounded: bool
     before_backdrop: BeforeBackdrop | None
     world_reason: str | None
+    decisions: tuple[Decision, ...]
+
+
+@dataclass(frozen=True)
+class _JudgedBackdrop:
+    """Whether views stand before a backdrop, tried against its masks."""
+
+    before: BeforeBackdrop | None = None
+    box: SceneBox | None = None
+    """Of what stands before it."""
+    decision: Decision | None = None
+
+
+_NO_BACKDROP = _JudgedBackdrop()
+
+
+def _judge_backdrop(views: Views) -> _JudgedBackdrop:
+    """Look for a backdrop that the views share, and try it.
+
+    Plain walls of a room share much with a backdrop, but stand at a finite distance among what they are behind: masks
+    cut from them contradict each other between views, as other views see a wall where one sees only background.
+    """
+    before = find_before_backdrop(views)
+    if before is None:
+        return _JudgedBackdrop(decision=Decision("backdrop", "none", {}, "", "--world"))
+    box, contradicted, masks = None, 0.0, before.masks()
+    if before.shows_matter:
+        try:
+            box = find_bounds(views.cameras, masks)
+            contradicted = share_contradicted(views.cameras, masks, box)
+        except SceneError:  # poses contradict it
+            contradicted = 1.0
+    tried = f"masks from it contradict each other behind more than {MOST_CONTRADICTED:.0%} of what they show"
+    is_refuted = contradicted > MOST_CONTRADICTED
+    evidence = {"looks": before.in_words, "contradicted": contradicted}
+    decision = Decision("backdrop", "none" if is_refuted else "found", evidence, tried, "--world")
+    if is_refuted:
+        return _JudgedBackdrop(decision=decision)
+    return _JudgedBackdrop(before, box, decision=decision)
 
 
 def find_model_space(
@@ -143,14 +184,10 @@ def find_model_space(
         return np.ones(view.size, dtype=bool) if view.unknown is None else ~view.unknown
 
     compared = Views(cameras[alike], read_view, read_valid)
-    before = box = points = None
-    if foreground is None and options.world == "auto" and len(alike) == len(train):
-        before = find_before_backdrop(compared)
-    if before is not None and before.shows_matter:
-        try:
-            box = find_bounds(cameras, before.masks())
-        except SceneError:  # poses contradict it
-            before = None
+    box = points = None
+    looked_for = foreground is None and options.world == "auto" and len(alike) == len(train)
+    backdrop = _judge_backdrop(compared) if looked_for else _NO_BACKDROP
+    before, box = backdrop.before, backdrop.box
     has_masks = box is not None or foreground is not None
     if not has_masks and meeting_point(cameras.camera_to_world.double().numpy()) is None:
         points = find_matched_points(compared)
@@ -161,16 +198,18 @@ def find_model_space(
         hint = describe(compare_conventions(poses[alike], compared))
         raise SceneError(f"{root}: {error}" + (f"\n{hint}" if hint else "")) from error
     is_unbounded, reason = options.world == "unbounded", None
+    decisions = [] if backdrop.decision is None else [backdrop.decision]
     if options.world == "auto" and not has_masks and not (points and points.are_equally_far):
         evidence = find_world_evidence(box, compared)
         if not evidence.goes_on:
             places = points or find_matched_points(compared)
             evidence = evidence if places is None else evidence.with_places(box, places.places)
         is_unbounded, reason = evidence.goes_on, evidence.in_words()
+        decisions.append(evidence.decision)
     low, high = box.aabb.double().numpy()
     scale = float(2.0 / (high - low).max())
     half = 0.5 * scale * (high - low)
     translation = first.translation - 0.5 * (low + high) / first.scale
     normalisation = Normalisation(first.rotation, translation, first.scale * scale)
     own_box = SceneBox(torch.from_numpy(np.stack([-half, half])).float())
-    return ModelSpace(normalisation, own_box, is_unbounded, before, reason)
+    return ModelSpace(normalisation, own_box, is_unbounded, before, reason, tuple(decisions))
