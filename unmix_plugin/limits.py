@@ -18,6 +18,12 @@ from unmix_plugin.errors import UnmixError
 MOST_PARTS = 4096
 """Parts of one file: members of an archive, pages, groups, variables. Instruments write some hundred bands as pages."""
 
+MOST_BANDS = 1 << 16
+"""Of an image or spectrum; spectrometers of any kind have some thousand."""
+
+MOST_ITEMS = 1 << 20
+"""Of one list in a text."""
+
 DEEPEST = 32
 """Levels of parts within parts."""
 
@@ -57,10 +63,12 @@ def refuse(path: Path, found: str, expected: str, kind: type[UnmixError]) -> NoR
     raise kind(f"{path}: {found}; expected {expected}: the file is damaged, or not made by an instrument")
 
 
-def allow_parts(path: Path, number: int, noun: str, kind: type[UnmixError]) -> None:
-    """Ask before parts are read one after the other. Raises UnmixError: of this kind: there are too many."""
-    if number > MOST_PARTS:
-        refuse(path, f"{number} {noun}", f"at most {MOST_PARTS}", kind)
+def allow_parts(path: Path, number: int, noun: str, kind: type[UnmixError], most: int | None = None) -> None:
+    """Ask before parts are read one after the other, or anything is made for each of them. Raises UnmixError: of this
+    kind: there are more than `most`, or than `MOST_PARTS`."""
+    most = MOST_PARTS if most is None else most
+    if number > most:
+        refuse(path, f"{number} {noun}", f"at most {most}", kind)
 
 
 def allow_depth(path: Path, levels: int, kind: type[UnmixError]) -> None:

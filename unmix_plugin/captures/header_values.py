@@ -228,9 +228,9 @@ def check_bands(stated: StatedBands, num_bands: int, warnings: list[str]) -> Ban
             if factor is None:
                 warnings.append(found)
             else:
-                nearest = np.arange(num_bands)
-                if unused.any():  # an unused band gets the wavelength of the nearest band that is used
-                    nearest = np.abs(np.subtract.outer(nearest, np.flatnonzero(~unused))).argmin(axis=1)
+                # An unused band gets the wavelength of the nearest band that is used, of two the first.
+                middles = np.convolve(np.flatnonzero(~unused), (0.5, 0.5), "valid")
+                nearest = np.searchsorted(middles, np.arange(num_bands))
                 centres, evidence = used[nearest] * factor, found
                 evidence += f"; {int(unused.sum())} are 0: bands that are not used" if unused.any() else ""
     named_fwhm = None
@@ -238,9 +238,14 @@ def check_bands(stated: StatedBands, num_bands: int, warnings: list[str]) -> Ban
     if named is not None and names is not None:
         centres, evidence = named[0], f"names of bands, such as {names[0]!r}: {named[1]}"
         named_fwhm = named[2] if stated.fwhm is None else None
+        factor = nm_per_unit((stated.unit or "").strip()) or 1.0
     if centres is not None and (np.diff(centres[~unused]) == 0).any():
         warnings.append("two bands beside each other have the same wavelength")
     fwhm = _numbers("FWHM", stated.fwhm, num_bands, warnings)
+    if fwhm is not None and centres is None:
+        warnings.append("FWHM are left out, as the file gives no wavelengths beside them")
+    elif fwhm is not None and (fwhm[~unused] <= 0).any():
+        warnings.append(f"FWHM are left out: they go down to {fwhm[~unused].min():g}")
     if fwhm is not None and factor is not None and centres is not None and (fwhm[~unused] > 0).all():
         fwhm = np.where(unused, fwhm[~unused].mean(), fwhm)
         fwhm = _widths_nm(fwhm, (stated.fwhm_unit or "").strip(), factor, centres, warnings)

@@ -24,7 +24,7 @@ from jaxtyping import Float, Float32
 from unmix_plugin.engine.runs.atomic_files import write_errors_as, write_file
 from unmix_plugin.engine.runs.replacing import refuse_foreign, remove
 from unmix_plugin.formats.files import RowSink, raw_rows
-from unmix_plugin.limits import MOST_TEXT_BYTES, read_bounded
+from unmix_plugin.limits import MOST_BANDS, MOST_ITEMS, MOST_TEXT_BYTES, read_bounded
 from unmix_plugin.spectral.bands import Bands
 
 HeaderValue: TypeAlias = str | int | Sequence[str] | Sequence[float] | np.ndarray
@@ -132,13 +132,14 @@ def _parse_header(text: str) -> dict[str, str]:
         raise ValueError("its first line is not 'ENVI'")
     body, position = "\n".join(lines[1:]) + "\n", 0
     header: dict[str, str] = {}
+    unread: list[str] = []
     while position < len(body):
         end = body.index("\n", position)
         name, equals, value = body[position:end].partition("=")
         position = end + 1
         if not equals or _BRACE.search(name):
             if line := (name + equals + value).strip():
-                header[""] = "\n".join(filter(None, (header.get(""), line)))
+                unread.append(line)
             continue
         key = " ".join(name.lower().replace("_", " ").split())
         opening = re.compile(r"\s*([{[])").match(body, end - len(value))
@@ -146,14 +147,16 @@ def _parse_header(text: str) -> dict[str, str]:
         if opening is not None and opening[1] == "{":
             close = _closing_brace(body, opening.start(1), key, key in header)
         elif opening is not None:  # NumPy's way, which a value of one line may begin with too
-            close = body.find("]", opening.end())
-            close = -1 if "=" in body[opening.end() : close] else close
+            next_equals = body.find("=", opening.end())
+            close = body.find("]", opening.end(), next_equals if next_equals >= 0 else len(body))
         if opening is not None and close >= 0:
             value, position = body[opening.end() : close], body.index("\n", close) + 1
         if _SAID_ONCE.fullmatch(key) and header.get(key, value.strip()) != value.strip():
             raise ValueError(f"'{key}' is there twice, with different values")
+        if key != "description" and (items := max(map(value.count, ", \n"))) >= MOST_ITEMS:
+            raise ValueError(f"the list of '{key}' has {items + 1:,} items; expected at most {MOST_ITEMS:,}")
         header[key] = value.strip()
-    return header
+    return header | ({"": "\n".join(unread)} if unread else {})
 
 
 def _closing_brace(body: str, start: int, key: str, is_repeated: bool) -> int:
@@ -222,6 +225,8 @@ def image_size(header: Mapping[str, str]) -> tuple[int, int, int]:
         ValueError: one is missing or no whole number above 0.
     """
     height, width, num_bands = (_count(header, key, least=1) for key in ("lines", "samples", "bands"))
+    if num_bands > MOST_BANDS:
+        raise ValueError(f"'bands' is {num_bands}; expected at most {MOST_BANDS}")
     return height, width, num_bands
 
 

@@ -240,6 +240,30 @@ def test_what_hdf5_says_of_its_image_is_used(tmp_path, content, expected):
     check_file(open_spectral_file(write_hdf5(tmp_path / "a.h5", content)), **expected)
 
 
+def write_unreadable(path, *names):
+    """An image whose attributes of these names have a type that NumPy has no word for."""
+    with h5py.File(path, "w") as file:
+        cube = file.create_dataset("cube", data=CUBE)
+        kind = h5py.h5t.TIME_D if hasattr(h5py.h5t, "TIME_D") else h5py.h5t.UNIX_D32LE
+        for name in names:
+            h5py.h5a.create(cube.id, name.encode(), kind, h5py.h5s.create(h5py.h5s.SCALAR))
+    return path
+
+
+def test_what_numbers_stand_for_is_never_passed_over_where_it_cannot_be_read(tmp_path):
+    """A scale that is there and not used would make all values false, a no-data value measured ones of others."""
+    with pytest.raises(CaptureError, match="'scale_factor' is of a type that can't be read: without it all"):
+        open_spectral_file(write_unreadable(tmp_path / "a.h5", "scale_factor"))
+    file = open_spectral_file(write_unreadable(tmp_path / "a.h5", "_FillValue", "wavelengths", "remark"))
+    assert [text for text in file.warnings if "can't be read: not used" in text] == [
+        f"attribute '{name}' can't be read: not used" for name in ("_FillValue", "wavelengths")
+    ]
+    with pytest.raises(CaptureError, match="'add_offset' is 'unknown', no number"):
+        open_spectral_file(write_hdf5(tmp_path / "b.h5", {"cube": (CUBE, {"add_offset": "unknown"})}))
+    unset = open_spectral_file(write_hdf5(tmp_path / "b.h5", {"cube": (CUBE, {"missing_value": "unset"})}))
+    check_file(unset, no_data=(), warning="attribute 'missing_value' is 'unset', no number: not used")
+
+
 def test_axes_by_the_names_of_netcdf4(tmp_path):
     square = CUBE[:5, :5]
     with h5py.File(tmp_path / "a.nc", "w") as opened:

@@ -90,6 +90,16 @@ SAID: dict[str, dict[str, Any]] = {
     "wavelength = {8, 9, 10, 11}": {"nm": [8000, 9000, 10_000, 11_000]},
     f"{UNIT}um\nwavelength = {{1, 2, 3, 4}}": {"nm": [1000, 2000, 3000, 4000]},
     "band names = {a (400 nm), b 500 nm, 600 nm, 700nm}": {"nm": NM, "evidence": "a (400 nm)"},
+    "band names = {400 nm, 500 nm, 600 nm, 700 nm}\nfwhm = {5, 5, 5, 6}": {"nm": NM, "fwhm": [5, 5, 5, 6]},
+    f"{UNIT}um\nband names = {{400 nm, 500 nm, 600 nm, 700 nm}}\nfwhm = {{.005, .005, .005, .006}}": {
+        "nm": NM,
+        "fwhm": [5, 5, 5, 6],
+    },
+    "band names = {a, b, c, d}\nfwhm = {5, 5, 5, 6}": {
+        "nm": None,
+        "fwhm": None,
+        "warning": "FWHM are left out, as",
+    },
     "band names = {0.4 um, 0.5 um, 0.6 um, 0.7 um}": {"nm": NM, "evidence": "unit um"},
     "band names = {A (0.39-0.41 um), B (0.49-0.51 um), C (0.58-0.62 um), D (0.65-0.75 um)}": RANGES,
     "band names = {Blue-390-410nm, 490\u2013510 nm, 580nm to 620nm, 0.65 - 0.75 um}": {"nm": NM},
@@ -134,6 +144,7 @@ WIDTHS = {
 }
 NO_WIDTHS = {
     FINE + "{900, 5.5, 5.5, 5.5}": "FWHM are left out: they would be 5.5 to 900 nm",
+    FINE + "{0, 5.5, 5.5, 5.5}": "FWHM are left out: they go down to 0",
     FINE + "{.00005, 5.5, 5.5, 5.5}": "FWHM are left out: they would be 5e-05 to 5.5 nm",
 }
 

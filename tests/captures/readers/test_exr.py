@@ -92,6 +92,19 @@ def test_one_of_several_layers_is_taken_or_named(tmp_path):
         open_spectral_file(tmp_path / "a.exr", ReadOptions(dataset="S3"))
 
 
+def test_between_layers_of_unknown_names_the_user_chooses(tmp_path):
+    channels = write_random(tmp_path / "a.exr", ["beauty.450nm", "albedo.450nm", "specular.450nm"])
+    with pytest.raises(
+        CaptureError, match=r"3 layers hold wavelengths \(albedo, beauty, specular\).*--dataset"
+    ):
+        open_spectral_file(tmp_path / "a.exr")
+    named = open_spectral_file(tmp_path / "a.exr", ReadOptions(dataset="specular"))
+    check_file(named, values=channels["specular.450nm"][..., None])
+    channels = write_random(tmp_path / "b.exr", ["beauty.450nm", "albedo.450nm", "450nm"])
+    said = "layer '' is taken; the file also has 'albedo', 'beauty'"
+    check_file(open_spectral_file(tmp_path / "b.exr"), values=channels["450nm"][..., None], warning=said)
+
+
 def test_channels_without_wavelengths_are_bands_without_them(tmp_path):
     channels = write_random(tmp_path / "a.exr", ["s0", "s1", "A"])
     check_file(open_spectral_file(tmp_path / "a.exr"), names=["s0", "s1"], nm=None)

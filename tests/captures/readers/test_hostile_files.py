@@ -87,6 +87,19 @@ def empty_numbers(path: Path) -> None:
         file.create_dataset("cube", (10**4, 10**4, 100), "f8", chunks=(10, 10, 10))
 
 
+def many_wavelengths(path: Path) -> None:
+    """A list of as many wavelengths as the image claims to have bands, of which nothing is in the file."""
+    with h5py.File(path, "w") as file:
+        file.create_dataset("cube", (1, 1, 10**9), "f4", chunks=(1, 1, 1000))
+        file.create_dataset("wavelength", (10**9,), "f4", chunks=(1000,))
+        file["cube"].attrs["wavelength_units"] = "nm"
+
+
+def many_bands(path: Path) -> None:
+    path.write_text(header_text(np.zeros((1, 1, 1), np.uint8), "bip", {"bands": 50_000_000}))
+    path.with_suffix("").write_bytes(b"0")
+
+
 def packed_variable(path: Path) -> None:
     size = 900 * 900
     head = _element(6, struct.pack("<II", 9, 0)) + _element(5, struct.pack("<3i", 900, 900, 1))
@@ -135,6 +148,12 @@ HOSTILE: dict[str, tuple[Callable[[Path], object], str]] = {
     "attributes.h5": (partial(many_parts, attributes=True), "101 attributes"),
     "chunk.h5": (packed_chunk, "decode to 2,430,000"),
     "empty.h5": (empty_numbers, "decode to 80,000,000,000"),
+    "wavelengths.h5": (many_wavelengths, "1000000000 bands; expected at most 65536"),
+    "bands.hdr": (many_bands, "'bands' is 50000000; expected at most 65536"),
+    "items.hdr": (
+        lambda path: path.write_text("ENVI\nwavelength = {" + "1," * (1 << 20) + "}"),
+        "1,048,577 items",
+    ),
     "packed.mat": (packed_variable, "decode to 810,000"),
     "variables.mat": (many_variables, "101 variables"),
     "packed.exr": (lambda path: write_exr(path, {"S0.450,0nm": ZEROS}), "decode to 3,240,000"),
@@ -168,6 +187,9 @@ SLOW: dict[str, str] = {
     "braces": "description = {" + "{" * LONG + "}",
     "descriptions": "description = {\n" * (LONG // 4) + "}",
     "commas": "wavelength = {" + "," * LONG + "}",
+    "lines that are no entries": "x\n" * LONG,
+    "lists in brackets that never end": "a = [\n" * LONG,
+    "lists in brackets that end far away": "a = [ 3\n" * LONG + "]",
 }
 
 

@@ -139,6 +139,14 @@ SAID: list[tuple[dict[str, Any], dict[str, Any]]] = [
             json.dumps({"Wavelength": [0.4, 0.41, 0.42, 0.43, 0.44, 0.45], "wavelength_units": "um"}),
             f"camera: x\nwavelengths (nm): {LISTED}\nshutter: 3",
             f"wavelength = {{{LISTED}}}",
+            "wavelengths: 400 nm, 410 nm, 420 nm, 430 nm, 440 nm, 450 nm",
+            "wavelengths: 400nm 410nm 420nm 430nm 440nm 450nm",
+            f"wavelengths = nm: {LISTED}",
+            f"Wavelengths in nm: {LISTED}",
+            f"wavelength [nm] = {LISTED}",
+            f"wavelength_units = nanometers\nwavelengths = {LISTED}",
+            "wavelengths: 0.4 um, 0.41 um, 0.42 um, 0.43 um, 0.44 um, 0.45 um",
+            "wavelength units: um; wavelengths: 0.4, 0.41, 0.42, 0.43, 0.44, 0.45",
         )
     ),
     (XMP, {"nm": [717], "fwhm": [10], "names": ["Red edge"]}),
@@ -163,6 +171,12 @@ SAID: list[tuple[dict[str, Any], dict[str, Any]]] = [
 @pytest.mark.parametrize(("options", "expected"), SAID)
 def test_what_tags_say_of_the_image_is_used(tmp_path, options, expected):
     check_file(written(tmp_path, **({"image": CUBE} | options)), **expected)
+
+
+def test_wavelengths_of_a_description_in_several_units_are_refused(tmp_path):
+    text = "wavelengths (um): 400 nm, 410 nm, 420 nm, 430 nm, 440 nm, 450 nm"
+    with pytest.raises(CaptureError, match=r"wavelengths in several units \(um, nm\)"):
+        written(tmp_path, CUBE, **described(text))
 
 
 @pytest.mark.parametrize(("first", "nm"), [(1, np.arange(400, 520, 10)), (0, None), (2, None)])

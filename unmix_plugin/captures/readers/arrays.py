@@ -40,6 +40,7 @@ from unmix_plugin.captures.spectral_file import (
     take_part,
 )
 from unmix_plugin.errors import CaptureError, name_some
+from unmix_plugin.limits import MOST_BANDS, MOST_TEXT_BYTES, allow_parts
 
 _TakePart: TypeAlias = Callable[[Axes, slice, BandIndex], np.ndarray]
 """(h, W, b) numbers of a stored array whose axes are these."""
@@ -49,6 +50,7 @@ _NO_DATA = (
     *("_fillvalue", "fillvalue", "fill_value", "missing_value", "missingvalue", "data_ignore_value"),
     *("nodata", "no_data", "nodata_value", "no_data_value"),
 )
+_VALID = ("valid_range", "valid_min", "valid_max")
 _GAINS = ("scale_factor", "scalefactor", "scale", "gain", "gains", "slope")
 _OFFSETS = ("add_offset", "offset", "offsets", "bias", "intercept")
 _OF_ALL = ("scale_factor", "reflectance_scale_factor", "add_offset")
@@ -69,6 +71,8 @@ _NUMBERS, _TEXTS = "iuf", "OSU"
 """NumPy's kinds of types that measure, where marks of bands may also be booleans; and of those that hold texts."""
 UNREAD = np.dtype("V")
 """Type of what a file holds that is neither numbers nor texts."""
+UNREADABLE = object()
+"""Value of an attribute that is there and can't be read."""
 _WITH_BANDS_AT: tuple[Axes, Axes, Axes] = ("byx", "ybx", "yxb")
 _LISTED = 12
 """How many arrays a message names."""
@@ -111,7 +115,8 @@ class FoundArray:
         """Whether it is a number or a list of them, also as MATLAB's matrix of one row or column; marks of bands may be
         booleans."""
         kinds = _NUMBERS + "b" * bool(GOOD.fullmatch(self.own_name))
-        return sum(length != 1 for length in self.shape) <= 1 and self.dtype.kind in kinds
+        is_list = sum(length != 1 for length in self.shape) <= 1 and prod(self.shape) <= MOST_BANDS
+        return is_list and self.dtype.kind in kinds
 
 
 def image_of_arrays(
@@ -145,8 +150,10 @@ def image_of_arrays(
     given = options.wavelengths_nm if options.wavelengths_nm is not None else stated.centres
     axes = choose_axes(shape, fixed, None if given is None else len(given), warnings)
     of_image = image_shape(shape, axes)
+    allow_parts(path, of_image[2], "bands", CaptureError, MOST_BANDS)
     bands = _without_windows(check_bands(stated, of_image[2], warnings), image)
     linear = _linear(path, image, of_image[2], warnings)
+    warnings += _unread(path, image)
     applied = "" if linear is None else linear.evidence
     exposure = exposure_facts(
         {key: entries[key] for key in entries if f"'{key}'" not in applied}, _WHERE, warnings
@@ -292,7 +299,8 @@ def _entries(arrays: Sequence[FoundArray], image: FoundArray) -> dict[str, Any]:
     def words_apart(key: str) -> int:
         return -len(words & set(re.split(r"[\W_]+", key.lower())))
 
-    attributes, words = image.all_attributes, set(re.split(r"[\W_]+", image.own_name))
+    attributes = {key: value for key, value in image.all_attributes.items() if value is not UNREADABLE}
+    words = set(re.split(r"[\W_]+", image.own_name))
     entries = {key: value for key, value in attributes.items() if not says_bands(key.lower())}
     entries |= _lists_beside(arrays, image)
     for key in sorted(attributes, key=words_apart):
@@ -337,6 +345,7 @@ def _lists_beside(arrays: Sequence[FoundArray], image: FoundArray) -> dict[str, 
         lengths = (1, *image.shape) if is_exposure(name) else image.shape if _lists_bands(array) else ()
         known = [key.rpartition("/")[2].lower() for key in beside]
         is_list = (*array.shape, 1)[0] in (1, *image.shape) if is_text else array.is_vector
+        is_list &= prod(array.shape) * max(1, array.dtype.itemsize) <= MOST_TEXT_BYTES
         if array is image or name in known or not (lengths and is_list):
             continue
         numbers = _texts(array) if is_text else _unpacked(array)
@@ -409,8 +418,31 @@ def _prisma(path: Path, image: FoundArray, num_bands: int) -> Linear | None:
     return linear_values(path, num_bands, [1.0 / factor], [-(offset or 0.0)], evidence) if factor else None
 
 
+def _unread(path: Path, image: FoundArray) -> list[str]:
+    """Warnings of attributes that say what stands for no measurement, or of bands, and that are no numbers or can't be
+    read at all. Raises CaptureError: what numbers are to be multiplied by can't be read."""
+    attributes, warnings = image.all_attributes, []
+    for name, key in plain_names(attributes).items():
+        value = attributes[key]
+        is_read = value is not UNREADABLE
+        is_own = key in image.attributes and name in (*_GAINS, *_OFFSETS) and name != "gain"
+        if name in _OF_ALL and not _numbers(value):
+            found = f"is {str(value)[:40]!r}, no number" if is_read else "is of a type that can't be read"
+            raise CaptureError(
+                f"{path}: attribute '{key}' {found}: without it all numbers would be false; write it as a number, or "
+                "take it out"
+            )
+        is_number = is_own or name in (*_NO_DATA, *_VALID)
+        if (is_number and not _numbers(value)) or (says_bands(name) and not is_read):
+            found = f"is {str(value)[:40]!r}, no number" if is_read else "can't be read"
+            warnings.append(f"attribute '{key}' {found}: not used")
+    return warnings
+
+
 def _numbers(value: Any) -> list[float]:
     """Numbers of an attribute; none where it is something else."""
+    if value is UNREADABLE:
+        return []
     try:
         return np.asarray(value, dtype=np.float64).reshape(-1).tolist()
     except (TypeError, ValueError):
@@ -450,9 +482,7 @@ def _valid_range(image: FoundArray, linear: Linear | None) -> tuple[float, float
     EnhanceScaleMissingUnsigned.
     """
     keys, attributes = plain_names(image.all_attributes), image.all_attributes
-    stated = {
-        name: attributes[keys[name]] for name in ("valid_range", "valid_min", "valid_max") if name in keys
-    }
+    stated = {name: attributes[keys[name]] for name in _VALID if name in keys}
     numbers = {name: _numbers(value) for name, value in stated.items()}
     low, high = numbers.get("valid_min", [-np.inf]), numbers.get("valid_max", [np.inf])
     both = numbers["valid_range"] if len(numbers.get("valid_range", [])) == 2 else [*low, *high]

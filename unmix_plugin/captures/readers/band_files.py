@@ -28,11 +28,17 @@ def open_band_folder(folder: Path, open_band: Callable[[Path], SpectralFile]) ->
     Wavelengths are in the files, or in their names. Raises CaptureError: there are no such files, they hold several
     bands each or differ in size, or a lens of a rig took each.
     """
-    found = [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
+    found = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
     kinds = Counter(_KINDS[path.suffix.lower()] for path in found if path.suffix.lower() in _KINDS)
     if not kinds:
         raise CaptureError(f"{folder}: no band files in this folder; expected one {', '.join(_KINDS)} a band")
-    kind, number = kinds.most_common(1)[0]
+    # JPEG beside as many others are previews of them.
+    (kind, number), *less = sorted(kinds.items(), key=lambda one: (-one[1], one[0] == "JPEG", one[0]))
+    if less and less[0][1] == number and less[0][0] != "JPEG":
+        raise CaptureError(
+            f"{folder}: as many files of {kind} as of {less[0][0]} ({number}); expected the bands of one image: move "
+            "one kind away"
+        )
     allow_parts(folder, number, "band files", CaptureError)
     files = [path for path in found if _KINDS.get(path.suffix.lower()) == kind]
     bands = [open_band(path) for path in sorted(files, key=lambda path: natural_order(path.name))]

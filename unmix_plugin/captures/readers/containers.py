@@ -21,7 +21,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from unmix_plugin.captures.readers.arrays import UNREAD, FoundArray, image_of_arrays
+from unmix_plugin.captures.readers.arrays import UNREAD, UNREADABLE, FoundArray, image_of_arrays
 from unmix_plugin.captures.spectral_file import (
     Axes,
     BandIndex,
@@ -32,7 +32,14 @@ from unmix_plugin.captures.spectral_file import (
     take_part,
 )
 from unmix_plugin.errors import CaptureError, counted
-from unmix_plugin.limits import allow_decoded, allow_depth, allow_parts, open_zip, refuse
+from unmix_plugin.limits import (
+    MOST_TEXT_BYTES,
+    allow_decoded,
+    allow_depth,
+    allow_parts,
+    open_zip,
+    refuse,
+)
 from unmix_plugin.scenes.reading.cubes import (
     READ_HEADER,
     UnreadableArrayError,
@@ -294,12 +301,14 @@ def _axis_names(item: Any) -> tuple[str, ...] | None:
 
 
 def _attributes(path: Path, item: Any) -> dict[str, Any]:
-    """Attributes that h5py can read; files of other programs hold types that it has no word for."""
+    """Attributes, `UNREADABLE` where h5py can't read one: programs write types that it has no word for."""
     attributes = {}
     allow_parts(path, len(item.attrs), "attributes", CaptureError)
     for name in item.attrs:
+        attributes[name] = UNREADABLE
         with suppress(OSError, TypeError, ValueError, RuntimeError):
-            attributes[name] = item.attrs[name]
+            if item.attrs.get_id(name).get_storage_size() <= MOST_TEXT_BYTES:
+                attributes[name] = item.attrs[name]
     return attributes
 
 

@@ -30,7 +30,7 @@ from unmix_plugin.captures.header_values import exposure_facts
 from unmix_plugin.captures.names import natural_order
 from unmix_plugin.captures.spectral_file import BandTable, ReadOptions, SpectralFile, loaded
 from unmix_plugin.captures.wavelengths import PLAUSIBLE_NM, wavelengths_in_names
-from unmix_plugin.errors import CaptureError
+from unmix_plugin.errors import CaptureError, name_some
 from unmix_plugin.limits import allow_decoded, allow_parts
 
 _HEADER_BYTES = 2**20
@@ -49,7 +49,8 @@ _COLOURS = (("R", "G", "B"), ("red", "green", "blue"))
 _OF_ALL_FILES = ("pixelAspectRatio", "screenWindowWidth")
 _DAMAGED = "can't be read as OpenEXR, copy the file again"
 LAYERS = ("S0", "T", "")
-"""Which of several layers is taken: radiance, reflectance, any other."""
+"""Which of several layers is taken: radiance, reflectance, channels of no layer. Between layers of other names nothing
+tells which one is meant."""
 
 
 @dataclass(frozen=True)
@@ -200,10 +201,11 @@ def _choose(
         return BandTable(names=(wanted,)), [channels[names.index(wanted)]]
     by_name = {channel.name: channel for channel in reversed(channels)}
     spectral = _spectral_channels(list(by_name))
-    layers = sorted({channel.layer for channel in spectral}, key=lambda layer: (*LAYERS, layer).index(layer))
+    known = {channel.layer for channel in spectral}
+    layers = [layer for layer in LAYERS if layer in known] + sorted(known - {*LAYERS})
     if wanted is not None and wanted not in layers:
-        known = ", ".join(layers + names)[:300]
-        raise CaptureError(f"{path}: no layer, part or channel '{wanted}'; it has {known}")
+        there = ", ".join(layers + names)[:300]
+        raise CaptureError(f"{path}: no layer, part or channel '{wanted}'; it has {there}")
     if not spectral:
         own = [channel.name for channel in channels if channel.part == channels[0].part]
         bands = [name for name in own if name.rpartition(".")[2] not in _ALPHA] or own
@@ -213,6 +215,11 @@ def _choose(
             evidence = f"names of channels, such as {bands[0]!r}: {found[1]}"
             table = replace(table, wavelengths_nm=found[0], evidence=evidence, fwhm_nm=found[2])
         return table, [by_name[name] for name in bands]
+    if wanted is None and len(layers) > 1 and layers[0] not in LAYERS:
+        raise CaptureError(
+            f"{path}: {len(layers)} layers hold wavelengths ({name_some(layers)}), and none of them is S0 (radiance) "
+            "or T (reflectance); name one (--dataset)"
+        )
     layer = layers[0] if wanted is None else wanted
     taken = [channel for channel in spectral if channel.layer == layer]
     widths = [channel.width_nm for channel in taken if channel.width_nm is not None]

@@ -37,7 +37,7 @@ from unmix_plugin.captures.spectral_file import (
     with_mask,
 )
 from unmix_plugin.errors import CaptureError, counted
-from unmix_plugin.limits import allow_decoded, allow_parts, refuse
+from unmix_plugin.limits import MOST_BANDS, allow_decoded, allow_parts, refuse
 from unmix_plugin.spectral.bands import nm_per_unit
 
 if TYPE_CHECKING:
@@ -60,10 +60,15 @@ _OPACITY = (1, 2)
 _GDAL_METADATA, _GDAL_NODATA, _DESCRIPTION, _PAGE_NAME = 42112, 42113, 270, 285
 _MOST_TAGS = 4096
 """What TIFF libraries take."""
+_UNIT = r"(?:nm|nanomet(?:er|re)s?|[uµμ]m|micromet(?:er|re)s?|microns?)(?![a-z])"
 _LIST = re.compile(
-    r"""["']?wavelengths?(?: ?\(?(?P<unit>[a-zµμ]{1,20})\)?)?["']?\s{0,9}[=:]\s*[\[{(]?(?P<list>[\d.,;\s]+)""",
+    rf"""["']?wave ?lengths?[ _]?[(\[]?(?:in )?(?P<unit>[a-zµμ]{{1,20}})?[)\]]?["']?"""
+    rf"""\s{{0,9}}[=:]\s{{0,9}}[\[{{(]?\s{{0,9}}(?:(?P<before>{_UNIT})[:\s]{{0,9}})?(?P<list>\d(?:[\d.,;\s]|(?<=[\d\s]){_UNIT})*)""",
     re.I,
 )
+"""`wavelengths = 450, 460`, with a unit behind the name (`wavelength (nm): ...`), before the numbers or behind each."""
+_ITEM = re.compile(rf"(\d+(?:\.\d+)?)\s?({_UNIT})?", re.I)
+_UNIT_BESIDE = re.compile(rf"""wave ?length[ _]?units?["']?\s{{0,9}}[=:]\s{{0,9}}["']?({_UNIT})""", re.I)
 
 
 @dataclass(frozen=True)
@@ -117,6 +122,7 @@ def open_tiff(path: Path, options: ReadOptions) -> SpectralFile:
         axes = choose_axes(stack.shape, options.axes, num_known, warnings, "byx")
         interleave = {"b": "bsq", "y": "bip" if axes[2] == "b" else "bil"}.get(axes[0])
     shape = image_shape(stack.shape, axes)
+    allow_parts(path, shape[2], "bands", CaptureError, MOST_BANDS)
     bands = check_bands(stated, shape[2], warnings)
     linear = gdal_linear(path, items, shape[2], "GDAL's", warnings)
     applied = "" if linear is None else linear.evidence
@@ -407,9 +413,20 @@ def _described(page: TiffPage) -> dict[str, Any]:
     if state_bands(entries, "image description").centres:
         return entries
     match = _LIST.search(text)
-    unit = match["unit"] if match and nm_per_unit(match["unit"] or "") else ""
-    found = re.findall(r"\d+(?:\.\d+)?", match["list"]) if match else []
-    return {"wavelength": found, "wavelength units": unit} if found else entries
+    if match is None:
+        return entries
+    found = _ITEM.findall(match["list"])
+    beside = _UNIT_BESIDE.search(text)
+    units = [match["unit"], match["before"], beside[1] if beside else None, found[0][1]]
+    known = [unit for unit in units if unit and nm_per_unit(unit)]
+    of_items = {unit.lower() for _, unit in found if unit}
+    if len({nm_per_unit(unit) for unit in (*known, *of_items)}) > 1:
+        said = ", ".join(dict.fromkeys(unit for unit in (*known, *sorted(of_items))))
+        raise CaptureError(
+            f"{page.parent.filename}: the description gives wavelengths in several units ({said}); correct it, or give "
+            "them yourself (--wavelengths)"
+        )
+    return {"wavelength": [number for number, _ in found], "wavelength units": known[0] if known else ""}
 
 
 def _from_pages(pages: list[TiffPage], imagej: dict[str, Any]) -> StatedBands:
