@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
 
+from unmix_plugin.engine.printing import plot_text
 from unmix_plugin.figures import plotting
 from unmix_plugin.figures.pictures import ColourScale, TitledPicture, draw_panels
 from unmix_plugin.products.endmembers import draw_spectra
@@ -121,6 +122,6 @@ def test_names_are_drawn_as_they_are_and_never_read_as_formulas(name):
     colours = np.array([[1.0, 0, 0], [0, 1.0, 0]])
     assert draw_spectra(spectra, x, [name, "other"], colours, (name, name)).startswith(b"\x89PNG")
     as_named, by_letter = Figure(), Figure()
-    as_named.text(0.1, 0.1, plotting.plot_text(name))
+    as_named.text(0.1, 0.1, plot_text(name))
     by_letter.text(0.1, 0.1, f" {name}" if name[0] == "_" else name, parse_math=False)
     assert plotting.figure_bytes(as_named) == plotting.figure_bytes(by_letter)

@@ -8,6 +8,7 @@ from pathlib import Path
 import tyro
 
 from unmix_plugin.engine.configs import DeviceName
+from unmix_plugin.engine.printing import tell
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,6 @@ def demo(arguments: list[str]) -> None:
     evaluate(words)
     export(["abundances", *words])
     export(["page", *words, "--resolution", "160"])
-    print(f"\npictures: {run.eval} (true, predicted, error) and {run.exports} (abundance maps)")
-    print(f"in 3-D, to open in a browser or to mail: {run.exports / 'page' / 'page.html'}")
-    print(f"look around in it: {shell_line('unmix-view', '--run', run.path)}")
+    tell(f"\npictures: {run.eval} (true, predicted, error) and {run.exports} (abundance maps)")
+    tell(f"in 3-D, to open in a browser or to mail: {run.exports / 'page' / 'page.html'}")
+    tell(f"look around in it: {shell_line('unmix-view', '--run', run.path)}")

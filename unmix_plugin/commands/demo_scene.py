@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from unmix_plugin.engine.printing import tell
 from unmix_plugin.errors import ConfigError
 
 
@@ -70,7 +71,7 @@ def _write_scene(options: _DemoSceneOptions) -> None:
     light = parse_light(options.illuminant or LAMP)
     make_demo_scene(folder, size, bands, views, options.overwrite, light, place)
     evaluation = len(list((folder / "abundances").glob("eval_*")))
-    print(
+    tell(
         f"{folder}: {views} views ({views - evaluation} to train on, {evaluation} for evaluation) of {size} x {size} "
         f"pixels and {bands} bands, in {time.perf_counter() - started:.1f} s"
     )
@@ -83,8 +84,8 @@ def _write_scene(options: _DemoSceneOptions) -> None:
         ("endmembers.csv", "true reflectances"),
         ("illuminant.csv", "the lamp's spectrum"),
     ):
-        print(f"  {folder / name}  {content}")
-    print(f"train on it: {shell_line('unmix-train', 'unmix-nerf', '--data', folder)}")
+        tell(f"  {folder / name}  {content}")
+    tell(f"train on it: {shell_line('unmix-train', 'unmix-nerf', '--data', folder)}")
 
 
 def _write_capture(options: _DemoSceneOptions) -> None:
@@ -108,7 +109,7 @@ def _write_capture(options: _DemoSceneOptions) -> None:
     place = marked_place() if options.markers else None
     shown = partial(follow, CommandConsole())
     make_demo_capture(folder, size, bands, views, options.overwrite, light, place, follow=shown)
-    print(
+    tell(
         f"{folder}: {views} raw views of {size} x {size} pixels and {bands} bands, 3 of them bad, in "
         f"{time.perf_counter() - started:.1f} s"
     )
@@ -119,11 +120,11 @@ def _write_capture(options: _DemoSceneOptions) -> None:
         (POSES, "where the cameras were, to compare with poses that were estimated"),
         ("truth", "true materials of each pixel and their reflectances, the lamp's spectrum"),
     ):
-        print(f"  {folder / name}  {content}")
+        tell(f"  {folder / name}  {content}")
     words = ["unmix-process", "cubes", "--data", folder, "--output-dir", "SCENE"]
     words += ["--white", folder / "white.hdr", "--dark", folder / "dark.hdr", "--poses"]
     marked = ["markers", "--marker-size", MARKER_SIZE, "--marker-family", MARKER_FAMILY]
-    print(f"make a scene of it: {shell_line(*words, *(marked if options.markers else ['estimate']))}")
+    tell(f"make a scene of it: {shell_line(*words, *(marked if options.markers else ['estimate']))}")
 
 
 def _numbers(options: _DemoSceneOptions, defaults: tuple[int, int, int]) -> tuple[int, ...]:

@@ -23,6 +23,7 @@ from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import Any, NoReturn
 
+from unmix_plugin.engine.printing import tell, terminal_text
 from unmix_plugin.errors import UnmixError, UnmixWarning
 
 DONE, INTERNAL_ERROR, USER_ERROR, INTERRUPTED, BROKEN_PIPE = 0, 1, 2, 130, 141
@@ -126,7 +127,7 @@ def _libraries_in_short() -> Iterator[None]:
         if isinstance(message, UnmixWarning):
             _say(f"warning: {message}")
         elif lacking is None:
-            usual(message, *where, **more)
+            usual(terminal_text(str(message)), *where, **more)
         elif not is_said:
             is_said, letter = True, chr(int(lacking[1]))
             _say(
@@ -199,12 +200,8 @@ def _verdict(error: Exception) -> tuple[str, int]:
     return f"this is a bug in unmix-nerf, please report it with what --debug shows: {text}", INTERNAL_ERROR
 
 
-_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
-"""What moves a terminal's cursor or changes its state; messages quote files of others."""
-
-
 def _say(message: str, is_debug: bool = False) -> None:
     with suppress(OSError):  # the terminal may be gone
         if is_debug:
-            traceback.print_exc()
-        print(_CONTROL.sub("?", message), file=sys.stderr)
+            tell(traceback.format_exc(), sys.stderr)
+        tell(message, sys.stderr)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import tyro
 
 from unmix_plugin.commands.entry import run_command
+from unmix_plugin.engine.printing import tell
 from unmix_plugin.errors import ConfigError, counted
 from unmix_plugin.products.product import RunOptions, SharedViews
 
@@ -96,7 +97,7 @@ def _compare(console: Console, runs: list[ComparedRun]) -> None:
     for remark in found.remarks:
         say(console, remark)
     drawn = counted(found.num_pictures, "picture")
-    print(f"{folder}  differences as CSV, of views and bands too, and {drawn}")
+    tell(f"{folder}  differences as CSV, of views and bands too, and {drawn}")
 
 
 def _evaluate_run(
@@ -124,7 +125,7 @@ def _evaluate_run(
             factors = None if recipe.illuminant is None else light_factors(scene, recipe)[0]
             scene = edit_scene(scene, recipe)
             for note in scene.notes:
-                print(note)
+                tell(note)
             words = ["eval", *(Path(given).stem for given in (options.edits, options.illuminant) if given)]
             folder = loaded.run.exports / safe_name("-".join(words))
     measured = spectral_scene(loaded.pipeline.datamanager)
@@ -165,7 +166,7 @@ def _report(console: Console, run: ComparedRun, found: Evaluated, is_edited: boo
 
     for what, how in _ALIGNED.items():
         if what in found.more.get("aligned", ()):
-            print(f"each evaluation view was aligned first: {how}")
+            tell(f"each evaluation view was aligned first: {how}")
     figures, title = run.figures, f"{run.path.name}: {counted(run.figures['views'], 'evaluation view')}"
     if "bands" in figures:
         title += f", {counted(figures['bands'], 'band')}"
@@ -183,12 +184,12 @@ def _report(console: Console, run: ComparedRun, found: Evaluated, is_edited: boo
     console.print(table)
     unknown = [name for name, value in figures.items() if value is None]
     if unknown:
-        print(f"not measured, since the scene does not have the truth for it: {', '.join(unknown)}")
-    print(f"{run.pictures / 'metrics.json'}  these figures, and those of each view")
+        tell(f"not measured, since the scene does not have the truth for it: {', '.join(unknown)}")
+    tell(f"{run.pictures / 'metrics.json'}  these figures, and those of each view")
     if found.num_pictures:
         kinds = ": rgb/, segmentation/ and abundances/, truth, where there is one, beside prediction"
         drawn = counted(found.num_pictures, "picture")
-        print(f"{run.pictures}  {drawn}{kinds if found.has_materials else ''}")
+        tell(f"{run.pictures}  {drawn}{kinds if found.has_materials else ''}")
 
 
 _ALIGNED = {

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import tyro
 
 from unmix_plugin.commands.entry import run_command
+from unmix_plugin.engine.printing import tell
 from unmix_plugin.engine.registry import BrokenPlugin, discover_methods
 from unmix_plugin.errors import ConfigError, counted
 from unmix_plugin.products.product import Job, Product, RunProduct, RunWork, ViewProduct
@@ -61,7 +62,7 @@ def export(argv: list[str]) -> None:
     """Parse the arguments, write the product, list its files."""
     own, broken = _own_products({product.name for product in PRODUCTS})
     for plugin in broken:
-        print(plugin, file=sys.stderr)
+        tell(plugin, file=sys.stderr)
     offered = sorted((*PRODUCTS, *(one.product for one in own.values())), key=lambda one: one.name)
     choices = tyro.extras.subcommand_type_from_defaults(
         {product.name: product for product in offered},
@@ -87,10 +88,10 @@ def _write(product: RunWork, own: dict[str, _OwnProduct], processes: Processes) 
     if not processes.is_first:
         return
     for file in written:
-        print(file)
+        tell(file)
     if written:
         folder = job.folder if written[0].is_relative_to(job.folder) else written[0].parent
-        print(f"{counted(len(written), 'file')} written to {folder}")
+        tell(f"{counted(len(written), 'file')} written to {folder}")
 
 
 def _open(product: RunWork, own: dict[str, _OwnProduct], processes: Processes) -> Job:

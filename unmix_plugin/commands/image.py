@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from unmix_plugin.commands.process_inspect import ReadingOptions
+from unmix_plugin.engine.printing import tell
 from unmix_plugin.errors import CaptureError, ConfigError, counted
 
 if TYPE_CHECKING:
@@ -86,7 +87,7 @@ def image(argv: list[str]) -> None:
     names = write_unmixed_image(folder, found, wavelengths, bands + 1, place, library, fractions)
     _say(found, mask, names)
     for path in paths:
-        print(f"  {path}")
+        tell(f"  {path}")
 
 
 def _say_what_was_read(opened: SpectralFile, mask: np.ndarray, num_bands: int, is_compared: bool) -> None:
@@ -95,35 +96,35 @@ def _say_what_was_read(opened: SpectralFile, mask: np.ndarray, num_bands: int, i
     from unmix_plugin.trained.run_materials import LIGHT_UNKNOWN
 
     size = f"{mask.shape[0]} x {mask.shape[1]} pixels, {counted(num_bands, 'band')}"
-    print(f"{opened.path}: {size}", flush=True)
+    tell(f"{opened.path}: {size}")
     for warning in opened.warnings:
-        print(f"looks wrong: {warning}")
+        tell(f"looks wrong: {warning}")
     if "geo_reference" in opened.metadata:
-        print("note: the maps do not keep the geo-reference of a TIFF; their pixels are those of the file")
+        tell("note: the maps do not keep the geo-reference of a TIFF; their pixels are those of the file")
     for note in opened.notes:
-        print(f"note: {note}")
+        tell(f"note: {note}")
     if is_srgb(opened):
-        print("the picture is taken as sRGB and brought to linear light")
+        tell("the picture is taken as sRGB and brought to linear light")
     if is_compared and stated_reflectance(opened) is None:
-        print(f"note: the file does not say that it holds reflectance. If it does not, {LIGHT_UNKNOWN}")
+        tell(f"note: the file does not say that it holds reflectance. If it does not, {LIGHT_UNKNOWN}")
     if left_out := opened.shape[2] - num_bands:
         why = "marked as bad in the file, of a wavelength that is there twice, or measured nowhere"
-        print(f"{counted(left_out, 'band')} left out: {why}")
+        tell(f"{counted(left_out, 'band')} left out: {why}")
     if not mask.all():
-        print(f"{counted(int((~mask).sum()), 'pixel')} without a measurement in every band left out")
+        tell(f"{counted(int((~mask).sum()), 'pixel')} without a measurement in every band left out")
 
 
 def _say(found: UnmixedImage, mask: np.ndarray, names: list[str]) -> None:
     """What was found, in a few lines."""
     if found.evidence:
-        print(found.evidence)
+        tell(found.evidence)
     counts = found.abundances[mask].mean(axis=0)
     for name, share in zip(names, counts, strict=True):
-        print(f"  {name:12s} {share:6.1%} of the {found.shares}")
+        tell(f"  {name:12s} {share:6.1%} of the {found.shares}")
     sure = float((found.confidence[mask] > _CONFIDENT).mean())
     misfit = float(found.misfit[mask].mean())
-    print(f"{sure:.0%} of the pixels are at least {_CONFIDENT:.0%} sure of their main material")
-    print(f"mean angle between a pixel and its mixture: {misfit:.4f} rad")
+    tell(f"{sure:.0%} of the pixels are at least {_CONFIDENT:.0%} sure of their main material")
+    tell(f"mean angle between a pixel and its mixture: {misfit:.4f} rad")
 
 
 def _fractions(cube: np.ndarray, mask: np.ndarray, count: int) -> NoiseFractions | None:

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from functools import partial
 
+from unmix_plugin.engine.printing import tell
+
 
 def process(arguments: list[str]) -> None:
     """Parse the arguments, make the scene, say where it is."""
@@ -27,5 +29,5 @@ def process(arguments: list[str]) -> None:
 
     console = CommandConsole()
     for finding in process_capture(options, partial(say, console), partial(follow, console)):
-        print(f"looks wrong: {finding}")
-    print(f"scene: {options.output_dir}")
+        tell(f"looks wrong: {finding}")
+    tell(f"scene: {options.output_dir}")

@@ -12,6 +12,7 @@ import tyro
 
 from unmix_plugin.captures.spectral_file import Axes, ReadOptions
 from unmix_plugin.commands.entry import DONE, USER_ERROR
+from unmix_plugin.engine.printing import tell
 from unmix_plugin.errors import CaptureError, ConfigError, counted
 
 _SHOWN = ("axes", "source", "exposure_s", "exposure_evidence", "gain", "gain_evidence", "f_number", "map")
@@ -55,7 +56,7 @@ def inspect_command(arguments: list[str]) -> int:
     reports = [_report(path, options.for_readers()) for path in options.files]
     if options.json:
         for report in reports:
-            print(json.dumps(report))
+            tell(json.dumps(report))
     else:
         _print_tables(reports)
     return USER_ERROR if any("error" in report for report in reports) else DONE

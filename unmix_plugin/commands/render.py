@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import tyro
 
 from unmix_plugin.commands.entry import run_command
+from unmix_plugin.engine.printing import tell
 from unmix_plugin.errors import ConfigError, counted
 from unmix_plugin.products.render import RenderOptions
 
@@ -147,9 +148,9 @@ def _render(
         write_file(path, legend_csv(output.classes))
     _list(folder, outputs, cameras, job.palette)
     for path in (*legends, *tables):
-        print(f"{path}  what the colours mean")
+        tell(f"{path}  what the colours mean")
     for path in camera_files:
-        print(f"{path}  the cameras, to be given to --cameras again")
+        tell(f"{path}  the cameras, to be given to --cameras again")
 
 
 def _list(
@@ -163,12 +164,12 @@ def _list(
         is_picture = one.format in ("png", "mp4")
         what = palette.describe(one.output, one.format == "mp4") if is_picture else one.output.what
         if is_video_of_all(one, cameras):
-            print(f"{paths[0]}  {counted(len(cameras.views), 'frame')}; {what}")
+            tell(f"{paths[0]}  {counted(len(cameras.views), 'frame')}; {what}")
         elif len(paths) == 1:
-            print(f"{paths[0]}  {what}")
+            tell(f"{paths[0]}  {what}")
         else:
             suffixes = " and ".join(dict.fromkeys(f"*{path.suffix}" for path in paths))
-            print(f"{paths[0].parent}  {len(paths)} files {suffixes}; {what}")
+            tell(f"{paths[0].parent}  {len(paths)} files {suffixes}; {what}")
 
 
 if __name__ == "__main__":  # of one of several processes

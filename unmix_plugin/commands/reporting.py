@@ -7,13 +7,15 @@ import shlex
 import subprocess
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
+from rich.segment import Segment
 
+from unmix_plugin.engine.printing import cleaned, tell
 from unmix_plugin.engine.runs.run_folder import newest_run
 
 if TYPE_CHECKING:
@@ -39,7 +41,7 @@ def chosen_run(run: Path | None, output_dir: Path) -> Path:
     if run is not None:
         return run
     newest = newest_run(output_dir).path
-    print(f"newest run: {newest}", flush=True)
+    tell(f"newest run: {newest}")
     return newest
 
 
@@ -58,7 +60,12 @@ _COMPILING_INTERVAL_S = 0.2
 
 
 class CommandConsole(Console):
-    """Standard output, whose broken pipe is an exception like any other file's: rich would end the process."""
+    """Standard output without what would steer a terminal from a name, whose broken pipe is an exception like any other
+    file's: rich would end the process."""
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
+        """What is printed."""
+        return cleaned(super().render(renderable, options))
 
     def on_broken_pipe(self) -> None:
         """Raise it."""

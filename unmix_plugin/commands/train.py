@@ -18,6 +18,7 @@ import tyro
 from unmix_plugin.commands.entry import INTERRUPTED, run_command
 from unmix_plugin.commands.training import finish, first_config, prepare, with_limits_given
 from unmix_plugin.engine.configs import Common, Hidden, TrainerConfig
+from unmix_plugin.engine.printing import tell
 from unmix_plugin.engine.registry import MethodSpecification, discover_methods, find_method
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.viewer.access import TrainingViewerOptions
@@ -116,13 +117,13 @@ def train(argv: list[str]) -> None:
     """Parse the arguments, train, say where the run is."""
     methods, broken = discover_methods()
     for plugin in broken:
-        print(f"warning: {plugin}", file=sys.stderr)
+        tell(f"warning: {plugin}", file=sys.stderr)
     if argv and argv[0] in ("-h", "--help", "--help-all"):
         width = max((len(name) for name in methods), default=0)
-        print(_USAGE, "methods:", sep="\n")
+        tell(f"{_USAGE}\nmethods:")
         for name, method in sorted(methods.items()):
-            print(f"  {name:{width}}  {method.description}")
-        print(f"\n{_PROGRAM} METHOD --help lists the common options of a method, --help-all all of them.")
+            tell(f"  {name:{width}}  {method.description}")
+        tell(f"\n{_PROGRAM} METHOD --help lists the common options of a method, --help-all all of them.")
         return
     config, viewing = parse(argv)
 
@@ -143,13 +144,13 @@ def train(argv: list[str]) -> None:
             try:
                 finish(trainer, console)
             except Interrupted as stop:
-                print(stop, file=sys.stderr)
+                tell(stop, file=sys.stderr)
                 if stop.step is not None:
                     resume = shell_line(_PROGRAM, config.method_name, "--load-run", stop.run)
-                    print(f"go on with: {resume}", file=sys.stderr)
-                print(f"run: {stop.run}", flush=True)
+                    tell(f"go on with: {resume}", file=sys.stderr)
+                tell(f"run: {stop.run}")
                 sys.exit(INTERRUPTED)
-        print(f"run: {trainer.run.path}", flush=True)
+        tell(f"run: {trainer.run.path}")
 
 
 @contextmanager

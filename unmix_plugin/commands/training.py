@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, get_type_hints
 import tyro
 
 from unmix_plugin.engine.configs import TrainerConfig
+from unmix_plugin.engine.printing import tell
 from unmix_plugin.engine.registry import MethodSpecification, find_method
 from unmix_plugin.errors import ConfigError, counted, did_you_mean
 
@@ -67,7 +68,7 @@ def train(
     except Interrupted as stop:
         again = f"train(None, {method!r}, load_run={str(stop.run)!r})"
         raise KeyboardInterrupt(f"{stop}; go on with {again}") from stop
-    print(f"run: {trainer.run.path}", flush=True)
+    tell(f"run: {trainer.run.path}")
     return open_loaded(trainer.run.path, config.device).scene
 
 

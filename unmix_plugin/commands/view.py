@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import tyro
 
+from unmix_plugin.engine.printing import tell
 from unmix_plugin.products.product import RunOptions
 from unmix_plugin.viewer.access import ViewerOptions
 
@@ -41,11 +42,11 @@ def view(argv: list[str]) -> None:
     options = tyro.cli(ViewOptions, prog="unmix-view", args=argv)
     viewer = prepared(options)
     viewer.start()
-    print("stop with Ctrl-C", flush=True)
+    tell("stop with Ctrl-C")
     try:
         viewer.wait()
     except KeyboardInterrupt:
-        print("stopped", flush=True)
+        tell("stopped")
     finally:
         viewer.stop()
 
@@ -69,13 +70,13 @@ def prepared(options: ViewOptions) -> Viewer:
         source = source_of_run(loaded)
     note = None if recipe is None else assumption_of_light(loaded.materials_scene, recipe)
     if note is not None:
-        print(note, flush=True)
+        tell(note)
     shown = loaded.materials_scene if options.library else None
     known = None if shown is None else library_of(options.library, shown.bands, shown.light_power)
     with working(console, "looking at the scene"):
         scene = partial(_scene_of, source, options.data)
         services = Services(source, scene, recipe, options.viewer.environments, known)
-        return Viewer(services, options.viewer, partial(print, flush=True))
+        return Viewer(services, options.viewer, partial(print))
 
 
 def _scene_of(source: SceneSource, data: Path | None) -> Scene:

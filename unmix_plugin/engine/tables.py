@@ -6,8 +6,7 @@ import csv
 import io
 from collections.abc import Iterable, Sequence
 
-_FORMULA_STARTS = ("=", "+", "-", "@", "\t")
-"""First letters by which spreadsheets take a cell for a formula (OWASP, CSV injection)."""
+from unmix_plugin.engine.printing import cell_text
 
 
 def csv_bytes(rows: Iterable[Sequence[object]]) -> bytes:
@@ -19,19 +18,7 @@ def csv_bytes(rows: Iterable[Sequence[object]]) -> bytes:
     ['name,value', '_=1+1,-0.5', 'leaf,3']
     """
     text = io.StringIO(newline="")
-    csv.writer(text, lineterminator="\n").writerows([_cell(value) for value in row] for row in rows)
+    csv.writer(text, lineterminator="\n").writerows(
+        [cell_text(value) if isinstance(value, str) else value for value in row] for row in rows
+    )
     return text.getvalue().encode()
-
-
-def _cell(value: object) -> object:
-    if not isinstance(value, str):
-        return value
-    # A carriage return, which Python's writer leaves unquoted, ends a row for readers.
-    value = value.replace("\r", "_")
-    if not value.startswith(_FORMULA_STARTS):
-        return value
-    try:
-        float(value)
-    except ValueError:
-        return f"_{value}"
-    return value

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float64, UInt8
 
+from unmix_plugin.engine.printing import plot_text
 from unmix_plugin.figures.plotting import (
     FIGURE_DPI,
     Colour,
@@ -27,7 +28,6 @@ from unmix_plugin.figures.plotting import (
     draw_swatch,
     figure_bytes,
     page_in_inches,
-    plot_text,
 )
 from unmix_plugin.formats.files import rgba_png_bytes
 from unmix_plugin.spectral.colour.srgb import decode_srgb, encode_srgb

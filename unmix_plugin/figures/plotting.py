@@ -18,6 +18,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from unmix_plugin.engine.printing import plot_text
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import rgb_matrix
 from unmix_plugin.spectral.colour.difference import srgb_to_lab
@@ -45,17 +46,6 @@ def css_colour(srgb: Colour) -> str:
     '#ff8000'
     """
     return "#" + "".join(f"{round(255 * min(max(float(value), 0.0), 1.0)):02x}" for value in srgb)
-
-
-def plot_text(text: str) -> str:
-    """A text of a user or a file as matplotlib draws it letter by letter: it takes what stands between two `$` for a
-    formula, and leaves labels that begin with `_` out of legends.
-
-    >>> print(plot_text("5$ a_1 $"), plot_text("_leaf"))
-    5\\$ a_1 \\$  _leaf
-    """
-    escaped = text.replace("$", r"\$")
-    return f" {escaped}" if escaped.startswith("_") else escaped
 
 
 def page_in_inches(width: float, height: float) -> tuple[Any, Any]:

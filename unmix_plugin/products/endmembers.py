@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float64, Shaped
 
+from unmix_plugin.engine.printing import plot_text
 from unmix_plugin.engine.runs.replacing import remove
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.figures.plotting import figure_bytes, plain_axes, plot_text
+from unmix_plugin.figures.plotting import figure_bytes, plain_axes
 from unmix_plugin.formats.envi import envi_library_paths, write_envi_library
 from unmix_plugin.formats.files import csv_bytes, make_folder, write_file
 from unmix_plugin.formats.libraries import library_of

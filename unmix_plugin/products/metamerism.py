@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
+from unmix_plugin.engine.printing import plot_text
 from unmix_plugin.errors import SpectrumError
-from unmix_plugin.figures.plotting import draw_swatch, figure_bytes, page_in_inches, plot_text
+from unmix_plugin.figures.plotting import draw_swatch, figure_bytes, page_in_inches
 from unmix_plugin.formats.files import csv_bytes, write_file
 from unmix_plugin.formats.libraries import library_of
 from unmix_plugin.products.product import Job

@@ -17,8 +17,9 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 from unmix_plugin.editing.recipe_files import read_recipe
+from unmix_plugin.engine.printing import plot_text
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.figures.plotting import figure_bytes, mark_lone_points, plain_axes, plot_text
+from unmix_plugin.figures.plotting import figure_bytes, mark_lone_points, plain_axes
 from unmix_plugin.formats.envi import envi_library_paths, write_envi_library
 from unmix_plugin.formats.files import NOT_PORTABLE, make_folder, safe_name, write_file
 from unmix_plugin.formats.libraries import library_of

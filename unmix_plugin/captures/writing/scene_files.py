@@ -29,10 +29,11 @@ from unmix_plugin.captures.report import report_text
 from unmix_plugin.captures.spectral_file import CaptureView
 from unmix_plugin.captures.value_checks import ViewSample, check_files, check_values
 from unmix_plugin.captures.writing.view_files import FULL_SCALE, BackgroundRule, ViewRecord
+from unmix_plugin.engine.printing import plot_text, terminal_text
 from unmix_plugin.engine.runs.atomic_files import write_file
 from unmix_plugin.errors import counted, name_some
 from unmix_plugin.figures.pictures import Canvas, CanvasLayout, columns_for
-from unmix_plugin.figures.plotting import FIGURE_DPI, figure_bytes, plain_axes, plot_text
+from unmix_plugin.figures.plotting import FIGURE_DPI, figure_bytes, plain_axes
 from unmix_plugin.formats.meshes import write_ply
 from unmix_plugin.scenes.backdrops import Backdrop
 from unmix_plugin.spectral.bands import Bands
@@ -77,7 +78,7 @@ def write_scene_files(
     measured.append(check_matches([(v.camera, v.picture) for v in same], angles_between(same), findings))
     title = f"{plan.capture.root}: {len(seen)} views, {_sizes_in_words(plan)}"
     done = _what_was_done(plan, posed, [view.record for view in seen])
-    write_file(folder / _REPORT_NAME, report_text(title, findings, measured, done).encode())
+    write_file(folder / _REPORT_NAME, terminal_text(report_text(title, findings, measured, done)).encode())
     write_file(folder / _SHEET_NAME, _contact_sheet(seen, plan.sensors, posed.poses, title))
     views = [asdict(view.record) for view in seen]
     totals = ("num_pixels", "saturated_pixels", "missing_pixels", "clipped_values", "negative_values")

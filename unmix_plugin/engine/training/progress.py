@@ -11,16 +11,18 @@ import json
 import math
 import time
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
 from rich.progress import BarColumn, Progress, TextColumn
+from rich.segment import Segment
 
+from unmix_plugin.engine.printing import cleaned, terminal_text
 from unmix_plugin.engine.runs.atomic_files import cannot_write, parse_plain_json, write_file
 from unmix_plugin.engine.runs.replacing import hash_of, list_file, move_aside
 from unmix_plugin.engine.runs.run_folder import RunFolder
@@ -77,6 +79,10 @@ class ProgressConsole(Console):
 
     is_closed = False
     """Whether that has happened; training then stops as after Ctrl-C."""
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
+        """What is printed, without what would steer a terminal from a name."""
+        return cleaned(super().render(renderable, options))
 
     def on_broken_pipe(self) -> None:
         """Drop everything from now on."""
@@ -197,7 +203,7 @@ class MetricsWriter:
 
 def write_event(run: RunFolder, text: str) -> None:
     """Append a dated line to `run.log`. Raises RunError: it can't be written."""
-    _append(run.log_path, f"{datetime.now(timezone.utc).isoformat(timespec='seconds')} {text}")
+    _append(run.log_path, f"{datetime.now(timezone.utc).isoformat(timespec='seconds')} {terminal_text(text)}")
 
 
 def _append(path: Path, line: str) -> None:

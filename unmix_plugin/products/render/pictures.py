@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float64, UInt8
 
+from unmix_plugin.engine.printing import plot_text
 from unmix_plugin.engine.registry import Output
 from unmix_plugin.figures.pictures import (
     ColourScale,
@@ -31,7 +32,6 @@ from unmix_plugin.figures.plotting import (
     figure_bytes,
     id_colours,
     page_in_inches,
-    plot_text,
 )
 from unmix_plugin.formats.files import csv_bytes, eight_bits
 from unmix_plugin.spectral.colour.srgb import decode_srgb, encode_srgb
