@@ -184,6 +184,28 @@ def test_gltf_alone_is_in_metres_where_the_scene_has_a_scale_and_y_is_up_in_it(f
     np.testing.assert_array_equal(plain, scaled)
 
 
+@pytest.mark.parametrize("axis", ["x", "y", "z"])
+def test_an_obj_stands_where_importers_take_y_for_up(outside, tmp_path, monkeypatch, axis):
+    up = np.eye(3)["xyz".index(axis)]
+    monkeypatch.setattr("unmix_plugin.products.mesh.world_up", lambda *_: up)
+    _write_mesh(tmp_path, ("obj", "ply"), outside, SCENE, FRAME)
+    ply = PlyData.read(tmp_path / "mesh.ply")["vertex"]
+    world = np.stack([ply[one] for one in "xyz"], axis=1)
+    lines = [line.split() for line in (tmp_path / "mesh.obj").read_text().splitlines()]
+    turned = np.array([line[1:4] for line in lines if line[0] == "v"], dtype=np.float32)
+    np.testing.assert_array_equal(turned[:, 1], world @ up.astype(np.float32))
+    np.testing.assert_allclose(np.linalg.norm(turned, axis=1), np.linalg.norm(world, axis=1), rtol=1e-6)
+    mesh = loaded_mesh(tmp_path / "mesh.obj")
+    assert mesh.volume > 0
+    outwards = np.array([line[1:4] for line in lines if line[0] == "vn"], dtype=float)
+    middle = turned.mean(axis=0)
+    assert ((turned - middle) * outwards).sum(axis=1).mean() > 0.9 * RADIUS / FRAME.scale * 0.9
+    if axis == "z":  # Blender's import, y up to z up, gives back the world
+        np.testing.assert_array_equal(np.stack([turned[:, 0], -turned[:, 2], turned[:, 1]], axis=1), world)
+    says = [" ".join(line) for line in lines if line[0] == "#"]
+    assert any("turned so that y is up" in one for one in says) is (axis != "y")
+
+
 def test_ply_and_glb_have_the_same_floats_and_vertices_the_material_of_their_half(files, outside):
     vertices, glb = PlyData.read(files[".ply"])["vertex"], loaded_mesh(files[".glb"])
     world = FRAME.to_world(outside.vertices).astype(np.float32)

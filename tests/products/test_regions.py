@@ -15,6 +15,7 @@ from tests.trained.camera_scenes import FRAME
 from unmix_plugin.engine.runs.atomic_files import RUN_FORMAT
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.errors import ConfigError, RunError
+from unmix_plugin.trained import measured_surface
 from unmix_plugin.trained.measured_surface import MeasuredSurface
 from unmix_plugin.trained.measures import keep_region, read_measures
 from unmix_plugin.trained.regions import Box, InView, OfMaterial, check_name, polygon_mask
@@ -78,9 +79,21 @@ def test_a_view_marks_what_it_sees_and_not_what_is_behind(surface):
     rough = MeasuredSurface(SCENE, TriangleMesh(1.02 * surface.mesh.vertices, surface.mesh.faces))
     same = rough.measure(InView.of_mask(fine, polygon_mask(corners, (1280, 1280))), "same")
     assert same.area == pytest.approx(patch.area, rel=0.05)
-    corner = InView.of_mask(CAMERA, polygon_mask([(0.0, 0.0), (3.0, 0.0), (0.0, 3.0)], (40, 40)))
-    with pytest.raises(ConfigError, match="has nothing of the surface"):
-        surface.measure(corner, "corner")
+
+
+def test_a_camera_of_any_size_costs_a_million_rays_at_most(surface, monkeypatch):
+    looked, look = [], type(SCENE).look
+
+    def noted(scene, camera, **more):
+        looked.append(camera.width * camera.height)
+        return look(scene, camera, **more)
+
+    assert measured_surface._MOST_RAYS <= 1 << 20
+    monkeypatch.setattr(measured_surface, "_MOST_RAYS", 1 << 14)
+    monkeypatch.setattr(type(SCENE), "look", noted)
+    seen = surface.measure(InView(CAMERA.resized(2048, 2048), [0, 2048 * 2048]), "seen")
+    assert seen.area == pytest.approx(2 * np.pi * WORLD_RADIUS**2 * (1 - RADIUS / 3), rel=0.12)
+    assert looked == [1 << 14]
 
 
 def test_regions_come_back_as_they_were_kept(tmp_path):

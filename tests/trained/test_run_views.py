@@ -6,11 +6,15 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.method_factory import make_scene
 from tests.trained.camera_scenes import FRAME, around, record
 from unmix_plugin.errors import ConfigError, RunError
+from unmix_plugin.products.render import RenderOptions
+from unmix_plugin.products.render.cameras import choose_cameras
 from unmix_plugin.trained.run_views import (
     RunView,
     affine_to_world,
+    cameras_of,
     directions_to_world,
     find_view,
     recorded_views,
@@ -32,6 +36,20 @@ def test_a_view_is_found_by_its_number_among_the_numbered_or_by_any_name():
         find_view(VIEWS, "3")
     with pytest.raises(ConfigError, match=r"no view 'rihgt' \(did you mean right\?\)"):
         find_view(VIEWS, "rihgt")
+
+
+def test_a_run_without_evaluation_views_says_so_where_one_is_needed():
+    training = [replace(view, split="train") for view in OTHERS]
+    with pytest.raises(ConfigError, match="no view '0'; give a name such as 1"):
+        find_view([], "0", training)
+    with pytest.raises(ConfigError, match="no view '0'; the run has none"):
+        find_view([], "0")
+    with pytest.raises(ConfigError, match="no evaluation views; choose --cameras dataset-train"):
+        cameras_of(training, "eval")
+    scene = replace(make_scene(), views=tuple(training))
+    for cameras in ("dataset-eval", "interpolate"):
+        with pytest.raises(ConfigError, match="no evaluation views"):
+            choose_cameras(scene, RenderOptions(cameras=cameras))
 
 
 def test_views_are_named_as_the_frames_of_the_scene_or_numbered():

@@ -389,6 +389,31 @@ def _write_glb(
     return write_file(path, b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks)
 
 
+def turn_to_y(up: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
+    """The matrix of the least turn that takes a unit vector to +y; exact where it is along an axis.
+
+    >>> turn_to_y(np.array([0.0, 0.0, 1.0])).tolist()
+    [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]
+    """
+    x, y, z, w = least_turns(up, _Y)
+    matrix = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    whole = np.round(matrix)
+    return np.where(np.abs(matrix - whole) < 1e-12, whole + 0.0, matrix)
+
+
+def turned_by(
+    turn: Float64[np.ndarray, "3 3"], vectors: Float[np.ndarray, "P 3"]
+) -> Float[np.ndarray, "P 3"]:
+    """Vectors times a matrix, in their own type."""
+    return (vectors.astype(np.float64) @ turn.T + 0.0).astype(vectors.dtype)
+
+
 def least_turns(
     start: Float[np.ndarray, "*#turns 3"], end: Float[np.ndarray, "*#turns 3"]
 ) -> Float64[np.ndarray, "*turns 4"]:

@@ -25,7 +25,7 @@ from unmix_plugin.formats.files import (
     rgba_png_bytes,
     write_file,
 )
-from unmix_plugin.formats.meshes import obj_paths, write_glb, write_obj, write_ply
+from unmix_plugin.formats.meshes import obj_paths, turn_to_y, turned_by, write_glb, write_obj, write_ply
 from unmix_plugin.products.atlas import Atlas, texels_of, unwrap
 from unmix_plugin.products.product import Job
 from unmix_plugin.products.scene_products import Mesh
@@ -168,7 +168,8 @@ def _write_mesh(
 
     PLY carries all of it; glTF positions, normals, colours (linear), `_MATERIAL` and abundances; OBJ positions,
     normals, colours (sRGB) and the material of each face. Textures, if any, replace the colours of glTF and lie beside
-    an OBJ. Large coordinates are float64 in PLY and OBJ; glTF has them less `offset` in the extras of its mesh, in the
+    an OBJ, whose vertices are turned as glTF's node turns its mesh, since importers take y for up there, too. Large
+    coordinates are float64 in PLY and OBJ; glTF has them less `offset` in the extras of its mesh, in the
     world's units; its node makes them metres where the scene has a scale.
     """
     normals = mesh.normals
@@ -185,7 +186,7 @@ def _write_mesh(
             vertices = xyz_columns(world.vertices) | xyz_columns(turned, "n") | looks.properties()
             written.append(write_ply(path, vertices, world.faces, looks.comments(_WHAT)))
         elif kind == "obj":
-            written += _write_obj(path, world, turned, looks, textures)
+            written += _write_obj(path, world, turned, looks, axis, textures)
         else:
             written.append(_write_glb(path, world, turned, looks, axis, textures))
     return written
@@ -204,8 +205,14 @@ def _write_obj(
     mesh: TriangleMesh,
     normals: Float32[np.ndarray, "V 3"],
     looks: SurfaceAppearance,
+    up: Float64[np.ndarray, "3"],
     textures: _Textures | None,
 ) -> list[Path]:
+    turn = turn_to_y(up)
+    comments = looks.comments(_WHAT)
+    if not np.array_equal(turn, np.eye(3)):
+        rows = "; ".join(" ".join(f"{value:.9g}" for value in row) for row in turn)
+        comments.append(f"turned so that y is up: these coordinates are the world's times the matrix {rows}")
     # The material that most corners of a face have, that of the first where all differ.
     corners = looks.material_ids.astype(np.int64)[mesh.faces]
     materials = np.where(corners[:, 1] == corners[:, 2], corners[:, 1], corners[:, 0])
@@ -214,12 +221,12 @@ def _write_obj(
         for name, content in textures.pictures.items():
             pictures.append(write_file(_texture_path(path.parent, name), content))
         shown = (textures.atlas.uv, textures.atlas.faces, pictures[0].name)
-    vertices = (mesh.vertices, normals, looks.srgb)
+    vertices = (turned_by(turn, mesh.vertices), turned_by(turn, normals), looks.srgb)
     names, palette = looks.materials.names, looks.palette
     if (materials == NOTHING_ID).any():
         materials, names = materials.clip(max=len(names)), (*names, "nothing")
         palette = np.concatenate([palette, id_palette({})[:1]])
-    named = (names, palette, looks.comments(_WHAT))
+    named = (names, palette, comments)
     written = write_obj(path.with_suffix(""), *vertices, mesh.faces, materials, *named, shown)
     return [*written, *pictures]
 

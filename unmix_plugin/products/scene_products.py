@@ -65,7 +65,7 @@ class Mesh(Product):
     unseen: Literal["drop", "keep"] = "drop"
     """What to do with surfaces that no camera of the run sees, and that were therefore never learnt."""
     up: Literal["y", "z"] = "y"
-    """What is up in GLB: y, as glTF prescribes and its viewers expect, or z: turned by nothing."""
+    """What is up in GLB and OBJ: y, as glTF prescribes and importers expect of both, or z: turned by nothing."""
     texture_size: int | None = None
     """Texels along the edges of textures in GLB and beside OBJ: colour, segmentation, abundances; None: as many as the
     surface needs, from 1024 on. 0: none, colours of vertices instead."""

@@ -27,6 +27,8 @@ from unmix_plugin.trained.trained_scene import TrainedScene
 
 _CELLS_PER_PIXEL, _RESOLUTIONS = 2, (48, 256)
 """Along the longest edge of the scene box, and the least and most cells there."""
+_MOST_RAYS = 1 << 20
+"""By which it is found what of a region a camera sees."""
 _PARTS = ((2, 2, 2), (4, 1, 1), (1, 4, 1), (1, 1, 4))
 """Points of a triangle that tell how much of it is in a region, by their shares of its corners, in sixths."""
 
@@ -135,7 +137,8 @@ def points_in(
         rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
         height, width = int(rows[-1] - rows[0]) + 1, int(columns[-1] - columns[0]) + 1
         part = camera.crop(int(columns[0]), int(rows[0]), width, height)
-        # Pages and views from near have pixels far smaller than the surface is known.
-        seen = SeenSurface(scene, width * height, [part])
+        # Pages and views from near have pixels far smaller than the surface is known; more than a million pixels of a
+        # camera tell nothing more of what is before it, and a file may name a camera of any size.
+        seen = SeenSurface(scene, min(width * height, _MOST_RAYS), [part])
         inside[inside.clone()] = seen.shows(positions[inside], scene.pixel_size)
     return inside.numpy()

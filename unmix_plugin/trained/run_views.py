@@ -49,9 +49,10 @@ def find_view(numbered: Sequence[RunView], wanted: str, others: Sequence[RunView
     if wanted.isdecimal() and int(wanted) < len(numbered):
         return numbered[int(wanted)]
     hint = did_you_mean(wanted, list(by_name), likeness=0.4, form=" ({})")
-    raise ConfigError(
-        f"no view {wanted!r}{hint}; give a number from 0 to {len(numbered) - 1}, or a name such as {numbered[0].name}"
-    )
+    numbers = f"a number from 0 to {len(numbered) - 1}, or " if numbered else ""
+    known = [view.name for view in (*numbered, *others)]
+    advice = f"give {numbers}a name such as {known[0]}" if known else "the run has none"
+    raise ConfigError(f"no view {wanted!r}{hint}; {advice}")
 
 
 def views_of(views: Sequence[RunView], choice: ViewChoice) -> list[RunView]:
@@ -60,9 +61,20 @@ def views_of(views: Sequence[RunView], choice: ViewChoice) -> list[RunView]:
     return [view for split in splits for view in views if view.split == split]
 
 
-def cameras_of(views: Sequence[RunView], choice: ViewChoice) -> Cameras:
-    """The cameras of the views chosen, as one."""
-    chosen = [view.camera for view in views_of(views, choice)]
+def some_views_of(views: Sequence[RunView], choice: Literal["eval", "train"]) -> list[RunView]:
+    """The same, of which there has to be one; a ConfigError where a run has none."""
+    chosen = views_of(views, choice)
+    if not chosen:
+        missing, other = ("evaluation", "train") if choice == "eval" else ("training", "eval")
+        raise ConfigError(
+            f"the run has no {missing} views; choose --cameras dataset-{other} or a camera file"
+        )
+    return chosen
+
+
+def cameras_of(views: Sequence[RunView], choice: Literal["eval", "train"]) -> Cameras:
+    """The cameras of the views chosen, as one; a ConfigError where there is none."""
+    chosen = [view.camera for view in some_views_of(views, choice)]
     return Cameras.of_sizes(
         torch.cat([camera.camera_to_world for camera in chosen]),
         torch.cat([camera.focal_px for camera in chosen]),

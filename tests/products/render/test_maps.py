@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -15,10 +16,11 @@ from unmix_plugin.products.render import RenderOptions, files
 from unmix_plugin.products.render.cameras import choose_cameras
 from unmix_plugin.products.render.files import choose_formats
 from unmix_plugin.products.render.job import RenderJob, take_survey
-from unmix_plugin.products.render.maps import map_camera
+from unmix_plugin.products.render.maps import gdal_metadata, map_camera
 from unmix_plugin.products.render.pictures import Palette
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.trained.measures import Scale
+from unmix_plugin.trained.run_materials import endmember_colours
 
 TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 PLACE = np.array([500_010.0, 5_400_020.0, 300.0])
@@ -188,3 +190,41 @@ def test_where_a_lamp_goes_with_the_camera_a_map_is_lit_squarely(tmp_path):
     assert len(found) > 30
     expected = SHADE * scene.materials.endmembers[0].numpy()
     np.testing.assert_allclose(found, np.broadcast_to(expected, found.shape), atol=5e-3)
+
+
+def test_bands_of_a_geotiff_have_names_wavelengths_and_colours(tmp_path):
+    names = {"spectral": "minisblack", "rgb": "rgb", "false-colour:650,550,450": "rgb", "depth": "minisblack"}
+    rendered(tmp_path, [*names, "segmentation"], ["tif"], 0.5)
+    centers = SCENE.bands.centers_nm
+    for name, photometric in names.items():
+        [path] = tmp_path.glob(f"{name.replace(':', '-').replace(',', '-')}/map_top.tif")
+        with tifffile.TiffFile(path) as file:
+            page: Any = file.pages.first
+            assert page.photometric.name.lower() == photometric
+            items = ElementTree.fromstring(page.tags["GDAL_METADATA"].value)
+        found = {(one.get("name"), int(one.get("sample", -1))): (one.text, one.attrib) for one in items}
+        if name == "spectral":
+            for index, nm in enumerate(centers):
+                assert found["DESCRIPTION", index][0] == f"{nm:g} nm"
+                assert float(found["wavelength", index][0] or "") == pytest.approx(nm)
+                value, where = found["CENTRAL_WAVELENGTH_UM", index]
+                assert (float(value or ""), where["domain"]) == (pytest.approx(nm / 1000), "IMAGERY")
+        elif name.startswith("false"):
+            shown = [float(found["wavelength", index][0] or "") for index in range(3)]
+            assert shown == [centers[SCENE.bands.nearest(nm)] for nm in (650.0, 550.0, 450.0)]
+        elif name == "rgb":
+            assert [found["DESCRIPTION", index][0] for index in range(3)] == ["red", "green", "blue"]
+        else:
+            assert set(found) == {("DESCRIPTION", 0)}
+    with tifffile.TiffFile(tmp_path / "segmentation" / "map_top.tif") as file:
+        page = file.pages.first
+        colours, ids = np.asarray(page.colormap), file.asarray()
+    assert set(np.unique(ids)) <= {0, 1, 2, 255}
+    expected = endmember_colours(SCENE.materials)
+    np.testing.assert_allclose(colours[:, :3].T / 65535, expected, atol=1e-4)
+
+
+def test_names_of_bands_are_text_and_no_markup():
+    *_, text, _ = gdal_metadata(['a<b>&"c"', "ß"])
+    names = [one.text for one in ElementTree.fromstring(text.rstrip(b"\0").decode())]
+    assert names == ['a<b>&"c"', "ß"]

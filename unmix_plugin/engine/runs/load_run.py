@@ -58,6 +58,7 @@ def load_model(path: Path, device: str = "auto") -> LoadedModel:
     config = load_config(path)
     scene = read_scene_record(run, config.pipeline.datamanager.target)
     checkpoint = _newest_checkpoint(run)
+    _require_fitting_grid(scene, checkpoint)
     try:
         model = config.pipeline.model.setup(scene_box=scene.scene_box, metadata=scene.metadata)
     except (UnmixError, LookupError, TypeError, ValueError, ArithmeticError) as error:
@@ -79,11 +80,23 @@ def load_pipeline(path: Path, device: str = "auto", data: Path | None = None) ->
     config = load_config(path)
     scene = read_scene_record(run, config.pipeline.datamanager.target)
     checkpoint = _newest_checkpoint(run)
+    _require_fitting_grid(scene, checkpoint)
     config = config if data is None else replace(config, data=data)
     pipeline: Pipeline = config.pipeline.setup(data=require_data(config), device=place, seed=config.seed)
     check_same_scene(scene, pipeline.datamanager, run)
     restore_model(checkpoint.tensors, pipeline.model, averaged=True)
     return LoadedPipeline(run, config, pipeline.eval(), scene, TrainingRecord.from_json(checkpoint.record))
+
+
+def _require_fitting_grid(scene: SceneRecord, checkpoint: Checkpoint) -> None:
+    """Refuse a grid that no tensor of the checkpoint is as large as, before memory is taken for it. Raises RunError."""
+    resolution = scene.metadata.get("grid_resolution")
+    largest = max((tensor.numel() for tensor in checkpoint.tensors.values()), default=0)
+    if isinstance(resolution, int) and resolution**3 > largest:
+        raise RunError(
+            f"the checkpoint does not fit the model that scene.json describes: a grid of {resolution} cells an edge "
+            f"has more numbers than its largest tensor, {largest:,}; train again"
+        )
 
 
 def _newest_checkpoint(run: RunFolder) -> Checkpoint:

@@ -14,7 +14,7 @@ from unmix_plugin.products.render.maps import MapInfo, map_camera
 from unmix_plugin.trained.camera_files import check_frames_per_second, check_size, read_camera_file
 from unmix_plugin.trained.measures import Scale
 from unmix_plugin.trained.protocol import RenderableScene
-from unmix_plugin.trained.run_views import RunView, cameras_of, find_view, resized_views, views_of
+from unmix_plugin.trained.run_views import RunView, cameras_of, find_view, resized_views, some_views_of
 
 _PATH_CAMERAS = ("orbit", "interpolate")
 _CAMERA_CHOICES = ("dataset-eval", "dataset-train", *_PATH_CAMERAS)
@@ -80,7 +80,7 @@ def _from_source(scene: RenderableScene, options: RenderOptions) -> RenderCamera
     if not 1 <= count <= _MOST_FRAMES:
         raise ConfigError(f"--frames {count}: expected 1 to {_MOST_FRAMES}")
     if source in ("dataset-eval", "dataset-train"):
-        views = views_of(scene.views, "eval" if source == "dataset-eval" else "train")
+        views = some_views_of(scene.views, "eval" if source == "dataset-eval" else "train")
         return RenderCameras(resized_views(views), False, None)
     if source == "orbit":
         return _path(source, orbit(cameras_of(scene.views, "train"), scene.scene_box, count))

@@ -25,7 +25,7 @@ from unmix_plugin.formats.envi import envi_cube_paths, envi_cube_rows
 from unmix_plugin.formats.exr import layer_names, write_exr, write_spectral_exr
 from unmix_plugin.formats.files import indexed_png_bytes, npy_rows, rgba_png_bytes, safe_name, write_file
 from unmix_plugin.formats.video import FrameSink, video_frames
-from unmix_plugin.products.render.maps import MapInfo
+from unmix_plugin.products.render.maps import MapInfo, gdal_metadata
 from unmix_plugin.products.render.pictures import (
     LIGHT_KINDS,
     Palette,
@@ -360,6 +360,14 @@ def _envi(output: Output, path: Path, setting: RenderSetting) -> Iterator[RowsSi
         yield lambda rows: add(rows.values[output.name].reshape(-1, *shape[1:]))
 
 
+def _wavelengths(output: Output, setting: RenderSetting) -> tuple[Sequence[float], Sequence[float]]:
+    """Centre of each channel, nm, where each is one band, and the widths where they are known."""
+    if output.kind in ("channels", "spectra") and setting.bands is not None:
+        widths = setting.bands.fwhm_nm
+        return setting.bands.centers_nm.tolist(), () if widths is None else widths.tolist()
+    return (output.centers_nm if isinstance(output, MaterialOutput) else ()), ()
+
+
 def _nothing(output: Output) -> int | None:
     """The number of pixels in which nothing is, where only that tells them: means of other programs leave it out."""
     if output.kind == "labels":
@@ -369,7 +377,7 @@ def _nothing(output: Output) -> int | None:
 
 @contextmanager
 def _tif(output: Output, path: Path, setting: RenderSetting) -> Iterator[RowsSink]:
-    """Numbers as TIFF, a band after the other; of a map as GeoTIFF."""
+    """Numbers as TIFF, a band after the other under its name; of a map as GeoTIFF."""
     add, planes, _ = _whole(output, setting)
     yield add
     buffer, info = io.BytesIO(), setting.map_info
@@ -377,10 +385,20 @@ def _tif(output: Output, path: Path, setting: RenderSetting) -> Iterator[RowsSin
     if (nothing := _nothing(output)) is not None:
         tags.append((_GDAL_NODATA, 2, len(str(nothing)) + 1, str(nothing), True))
     names = list(setting.channels.get(output.name, (output.name,)))
+    tags.append(gdal_metadata(names, *_wavelengths(output, setting)))
+    # Which band is red, green and blue; or the colour of each id.
+    kinds: dict[OutputKind, str] = {
+        **dict.fromkeys(("srgb", "linear", "picture"), "rgb"),
+        "labels": "palette",
+    }
+    palette = None
+    if output.kind == "labels":
+        palette = np.round(65535 * setting.palette.by_id(output).T).astype(np.uint16)
     with _require_tifffile().TiffWriter(buffer, bigtiff=planes.nbytes > _LARGEST_TIFF) as writer:
         writer.write(
             planes,
-            photometric="minisblack",
+            photometric=kinds.get(output.kind, "minisblack"),
+            colormap=palette,
             planarconfig="separate" if len(names) > 1 else None,
             compression="zlib",
             description=json.dumps({"output": output.name, "what": output.what, "bands": names}),

@@ -11,7 +11,9 @@ Source: GeoTIFF 1.1, OGC 19-008r4 (tags and keys); ENVI header format (map info)
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from html import escape
 from typing import Any
 
 import numpy as np
@@ -40,6 +42,8 @@ _USUAL_PIXELS = 512
 """Along the longest side, where nothing says how large pixels are."""
 _UTM_HALVES = {326: "North", 327: "South"}
 """Hundreds of the EPSG codes of WGS 84 / UTM, whose zones ENVI headers know by number."""
+_GDAL_METADATA = 42112
+"""Tag of GDAL's."""
 _OUTSIDE = 1.01
 """Where rays start, in half diagonals of the scene box from its middle."""
 
@@ -132,6 +136,28 @@ class MapInfo:
             (34735, 3, len(directory), tuple(directory), True),
             (34737, 2, len(citation) + 1, citation, True),
         ]
+
+
+def gdal_metadata(
+    names: Sequence[str], centers_nm: Sequence[float] = (), widths_nm: Sequence[float] = ()
+) -> tuple[int, int, int, bytes, bool]:
+    """GDAL's own tag of a TIFF as tifffile takes it: the description of each band, and where it is of one wavelength
+    that and its width, both as the IMAGERY domain of GDAL has them and as its ENVI driver reads them.
+
+    Source: GDAL documentation, GTiff driver (GDAL_METADATA) and raster data model (IMAGERY domain).
+    """
+    items = [(name, index, "DESCRIPTION", ' role="description"') for index, name in enumerate(names)]
+    for index, nm in enumerate(centers_nm):
+        items += [(f"{nm:.9g}", index, "wavelength", ""), ("Nanometers", index, "wavelength_units", "")]
+        items.append((f"{nm / 1000:.9g}", index, "CENTRAL_WAVELENGTH_UM", ' domain="IMAGERY"'))
+    for index, nm in enumerate(widths_nm):
+        items.append((f"{nm / 1000:.9g}", index, "FWHM_UM", ' domain="IMAGERY"'))
+    lines = [
+        f'  <Item name="{key}" sample="{index}"{where}>{escape(text)}</Item>'
+        for text, index, key, where in items
+    ]
+    text = "\n".join(["<GDALMetadata>", *lines, "</GDALMetadata>"]).encode("utf-8", "replace") + b"\0"
+    return (_GDAL_METADATA, 2, len(text), text, True)
 
 
 def map_camera(
