@@ -19,15 +19,30 @@ ANGLES = 10.0 * np.abs(np.subtract.outer(np.arange(VIEWS), np.arange(VIEWS)))
 
 @pytest.fixture(scope="module")
 def pinhole_views(tmp_path_factory) -> list[MatchedView]:
-    return make_views(tmp_path_factory.mktemp("pinhole"), lambda bent: bent)
+    return make_views(tmp_path_factory.mktemp("pinhole"), lambda bent: bent, bumps())
 
 
-def make_views(folder: Path, straighten) -> list[MatchedView]:
-    """Views of a floor with bumps of colour, through a lens that is told how to undo its bending."""
+def bumps() -> np.ndarray:
+    """A floor with bumps of colour that are all unlike each other."""
     generator = np.random.default_rng(0)
     waves = [ndimage.gaussian_filter(generator.random((600, 600)), width) * width for width in (2, 4, 9)]
     texture = np.sum(waves, axis=0)
-    texture = (texture - texture.min()) / np.ptp(texture)
+    return (texture - texture.min()) / np.ptp(texture)
+
+
+ROWS, COLUMNS = np.mgrid[:600, :600]
+REPEATED = {
+    "gingham": 0.2 + 0.3 * (COLUMNS // 20 % 2) + 0.3 * (ROWS // 20 % 2),
+    "stripes across": 0.2 + 0.3 * (COLUMNS // 20 % 2) + 0.3 * ((COLUMNS + ROWS) // 28 % 2),
+    "checks around a print": np.where(
+        np.hypot(COLUMNS - 300, ROWS - 300) < 90, bumps(), 0.3 + 0.4 * ((COLUMNS // 22 + ROWS // 22) % 2)
+    ),
+}
+
+
+def make_views(folder: Path, straighten, texture: np.ndarray) -> list[MatchedView]:
+    """Views of a floor, through a lens that is told how to undo its bending."""
+    generator = np.random.default_rng(1)
     columns, rows = np.meshgrid(np.arange(SIZE) + 0.5, np.arange(SIZE) + 0.5)
     ideal = straighten((np.column_stack([columns.ravel(), rows.ravel()]) - SIZE / 2) / FOCAL)
     views = []
@@ -37,8 +52,9 @@ def make_views(folder: Path, straighten) -> list[MatchedView]:
         rays = np.column_stack([ideal[:, 0], -ideal[:, 1], -np.ones(len(ideal))]) @ pose[:, :3].T
         x, y, _ = (position - position[2] / rays[:, 2:] * rays).T
         shown = ndimage.map_coordinates(texture, [300 + 90 * y, 300 + 90 * x], order=1, mode="mirror")
+        noisy = shown.reshape(SIZE, SIZE) + 0.01 * generator.standard_normal((SIZE, SIZE))
         path = folder / f"{index}.png"
-        Image.fromarray((255 * shown.reshape(SIZE, SIZE)).astype(np.uint8)).save(path)
+        Image.fromarray((255 * noisy.clip(0, 1)).astype(np.uint8)).save(path)
         views.append((PosedCamera(pose, LENS), path))
     return views
 
@@ -64,7 +80,14 @@ def test_a_fisheye_read_as_a_pinhole_does_not_fit_its_lens(tmp_path):
         angle = np.linalg.norm(bent, axis=1, keepdims=True)
         return bent * np.tan(angle) / angle
 
-    assert "do not fit their lens" in checked(make_views(tmp_path, straighten))[1][0]
+    assert "do not fit their lens" in checked(make_views(tmp_path, straighten, bumps()))[1][0]
+
+
+@pytest.mark.parametrize("name", REPEATED)
+def test_patterns_that_repeat_speak_against_no_poses(tmp_path, name):
+    """Squares and stripes match each other at one period's distance in all views alike."""
+    texture = ndimage.gaussian_filter(REPEATED[name], 1.0)
+    assert checked(make_views(tmp_path, lambda bent: bent, texture))[1] == []
 
 
 @pytest.mark.parametrize("size", [(SIZE, SIZE), (7, 5)])

@@ -1,10 +1,11 @@
 """Whether pictures fit their poses and lens, by features matched between near views.
 
-A view is compared with several around it. Matches are accepted by what two views alone tell: a fundamental matrix
-explains them. A feature found in three views or more is a point of space, whose place follows from poses and lens; how
-far from its pixels this place is seen is hardly more than the accuracy of features if all is right. A lens that is off,
-as one of another model read as ours, leaves more, and another lens explains the matches better: one with a focal length
-and two radial terms of its own is sought. Where none does, poses are off.
+A view is compared with several around it. Matches are accepted by what two views alone tell: neither view shows the
+like of a feature elsewhere, and a fundamental matrix explains them. A feature found in three views or more is a point
+of space, whose place follows from poses and lens; how far from its pixels this place is seen is hardly more than the
+accuracy of features if all is right. A lens that is off, as one of another model read as ours, leaves more, and another
+lens explains the matches better: one with a focal length and two radial terms of its own is sought. Where none does,
+poses are off.
 
 Notation: `T` points of one star, which is a view and those around it; `V` its views; ideal coordinates as in the
 lens's module. Points that a view does not show are NaN there.
@@ -35,6 +36,9 @@ _ANGLES_DEG = (3.0, 30.0)
 """Between the axes of a view and those around it."""
 _MOST_AMBIGUOUS = 0.8
 """Of a match, its difference over that of the second best."""
+_MOST_REPEATED, _SAME_PLACE_PX = 0.6, 3.0
+"""Of a match, its difference over that of either feature from the one most like it at another place of its own view:
+squares of a cloth match each other between views as well as they match themselves, and fit poses nobody has."""
 _LEAST_MATCHES, _LEAST_SHARE = 12, 0.4
 """That a fundamental matrix explains, and their share of all, with which two views count."""
 _RANSAC_PX, _RANSAC_TRIALS = 1.5, 150
@@ -218,6 +222,15 @@ def _find_star(
     return _Star(ideal, poses[:, :, :3] @ FLIP, poses[:, :, 3], shrunk * float(np.mean(lenses[0].focal_px)))
 
 
+def _nearest_in_own_view(features: tuple[Points, np.ndarray]) -> Float64[np.ndarray, " P"]:
+    """Difference of each feature from the one most like it at another place of the same view."""
+    places, descriptors = features[0], features[1].astype(np.float64)
+    squares = (descriptors**2).sum(axis=1)
+    differences = squares[:, None] + squares - 2 * descriptors @ descriptors.T
+    same = np.linalg.norm(places[:, None] - places, axis=-1) < _SAME_PLACE_PX
+    return np.sqrt(np.where(same, np.inf, np.maximum(differences, 0)).min(axis=1))
+
+
 def _matches(
     one: tuple[Points, np.ndarray], other: tuple[Float64[np.ndarray, "Q 2"], np.ndarray], shrunk: float
 ) -> tuple[Int[np.ndarray, " M"], Int[np.ndarray, " M"]]:
@@ -232,6 +245,10 @@ def _matches(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of descriptors that differ by nothing, samples that tell nothing
         found = match_descriptors(one[1], other[1], max_ratio=_MOST_AMBIGUOUS, cross_check=True)
+        alone = [_nearest_in_own_view(view) for view in (one, other)]
+        apart = np.linalg.norm(one[1][found[:, 0]].astype(float) - other[1][found[:, 1]], axis=1)
+        repeated = np.minimum(alone[0][found[:, 0]], alone[1][found[:, 1]])
+        found = found[apart < _MOST_REPEATED * repeated]
         if len(found) < _LEAST_MATCHES:
             return none, none
         _, explained = ransac(
