@@ -107,7 +107,7 @@ def test_a_path_becomes_a_video_of_the_edited_scene(run_copy):
     with served(run_copy) as (_, page):
         wait_for_control(page, "render a video")
         add_key_frames(page, 0.3, 0.6)
-        page.set("light", "A")
+        page.set("light", "A: light bulb")
         for label, value in (("width", 33), ("height", 32), ("seconds", 0.5), ("frames a second", 6)):
             page.set(label, value)
         page.wait_until(lambda: "illuminant: A" in page.controls[page.control("recipe")]["value"])
@@ -125,7 +125,7 @@ def test_a_run_is_shown_with_the_edits_and_the_light_asked_for(run_copy):
     recipe.write_text("edits:\n  - rename: {endmember: endmember_1, name: clay}\n")
     with served(run_copy, edits=recipe, illuminant="fl2") as (_, page):
         wait_for_control(page, "render a video")
-        assert page.controls[page.control("light")]["value"] == "FL2"
+        assert page.controls[page.control("light")]["value"] == "FL2: cool white fluorescent lamp"
         assert "clay" in page.controls[page.control("other endmember")]["options"]
         page.set("changes", "start again")
         page.wait_until(lambda: page.controls[page.control("light")]["value"] == "as recorded")

@@ -106,8 +106,11 @@ def first_of(make, holds, what):
 
 
 def wait_for_file(folder: Path, pattern: str) -> Path:
-    [*found] = first_of(lambda: list(folder.glob(pattern)), bool, f"{pattern} in {folder}")
-    return found[0]
+    def written():
+        """Those that are complete: an empty one only claims its name."""
+        return [path for path in folder.glob(pattern) if path.stat().st_size > 0]
+
+    return first_of(written, bool, f"{pattern} in {folder}")[0]
 
 
 def test_a_run_is_looked_at_probed_edited_and_saved(viewer, browser):
@@ -132,14 +135,14 @@ def test_a_run_is_looked_at_probed_edited_and_saved(viewer, browser):
     browser.keep("moved")
 
     browser.open_tab("probe")
-    page.mouse.click(WIDTH / 2, HEIGHT / 2)
+    page.mouse.click(*middle)
     page.get_by_text("position", exact=True).wait_for()
     page.locator("canvas:visible").nth(1).wait_for()  # the chart, beside the scene
     browser.keep("probe")
 
     browser.open_tab("materials")
     shown = browser.picture()
-    browser.choose("light", "A")
+    browser.choose("light", "A: light bulb")
     shown = browser.wait_for_other(shown)
     browser.keep("edited")
     page.get_by_role("button", name="save", exact=True).click()
@@ -155,6 +158,33 @@ def test_a_run_is_looked_at_probed_edited_and_saved(viewer, browser):
         assert picture.size == (240, 160)
         assert np.asarray(picture).std() > LEAST_SPREAD
     browser.keep("captured")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [(1280, 800), (1440, 900)])
+def test_tabs_lie_in_one_row_and_the_object_in_the_part_beside_them(browser, size):
+    width, height = size
+    browser.page.set_viewport_size({"width": width, "height": height})
+    tabs = browser.page.get_by_role("tab").all()
+    boxes = [tab.bounding_box() for tab in tabs]
+    assert len({box["y"] for box in boxes}) == 1
+    assert max(box["x"] + box["width"] for box in boxes) <= width
+    left = round(min(box["x"] for box in boxes)) - 8
+
+    def columns():
+        """Where the picture is not background, as parts of what is beside the controls."""
+        clip = {"x": 0, "y": 200, "width": left, "height": height - 300}  # below a notice of the browser's
+        shot = np.asarray(Image.open(io.BytesIO(browser.page.screenshot(clip=clip))).convert("RGB")).astype(
+            float
+        )
+        is_object = np.abs(shot - shot[0, 0]).max(axis=-1) > 30
+        return np.flatnonzero(is_object.any(axis=0)) / left
+
+    found = first_of(columns, lambda places: len(places) > 0, "object")
+    browser.keep(f"at_{width}")
+    assert found.min() > 0.02
+    assert found.max() < 0.98
+    assert abs((found.min() + found.max()) / 2 - 0.5) < 0.1
 
 
 @pytest.mark.slow

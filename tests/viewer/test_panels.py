@@ -26,12 +26,15 @@ from unmix_plugin.figures.plotting import css_colour
 from unmix_plugin.formats.files import eight_bits
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import illuminant_names, linear_to_srgb, rgb_matrix
+from unmix_plugin.spectral.library.material_library import LibraryMaterial, MaterialLibrary
+from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.camera_files import read_camera_file
 from unmix_plugin.trained.measured_surface import MeasuredSurface
 from unmix_plugin.trained.measures import Scale, keep_region, keep_scale, read_measures
 from unmix_plugin.trained.model_scene import ModelScene
 from unmix_plugin.trained.regions import Box, InView
 from unmix_plugin.trained.run_views import recorded_views, world_frame
+from unmix_plugin.viewer.panels.materials import likeness_rows
 from unmix_plugin.viewer.rendering.scene import Edit, SceneSource
 from unmix_plugin.viewer.rendering.settings import BACKGROUNDS
 
@@ -132,7 +135,7 @@ def test_the_point_cloud_follows_the_light_and_shows_no_hidden_material(viewer, 
     monkeypatch.setattr(SceneApi, "add_point_cloud", noted)
     page.set("point cloud")
     page.wait_until(lambda: len(clouds) == 1)
-    page.set("light", "A")
+    page.set("light", "A: light bulb")
     recipe = page.props("recipe")
     page.wait_until(lambda: len(clouds) == 2 and "illuminant: A" in recipe["value"])
     (points, colours), (same, relit) = clouds
@@ -367,7 +370,7 @@ CHANGES = (
     ("name", "clay", "name: clay"),
     ("replace by the known material", True, "library: ColorChecker/red"),
     ("swap with the other", True, "swap: [0, 2]"),
-    ("light", "FL2", "illuminant: FL2"),
+    ("light", "FL2: cool white fluorescent lamp", "illuminant: FL2"),
 )
 
 
@@ -432,8 +435,9 @@ def test_a_known_material_is_held_or_refused_beyond_its_bands(tmp_path, first_nm
         page.wait_until(lambda: any(title == one and said in text for one, text in page.notices))
         offered = page.props("light")["options"]
         assert 1 < len(offered) <= len(illuminant_names())
-        for name in offered[1:]:
-            edited = viewer.services.maker.edited(Edit(Recipe(illuminant=Light(name))))
+        for title in offered[1:]:
+            light = Light(title.partition(": ")[0])
+            edited = viewer.services.maker.edited(Edit(Recipe(illuminant=light)))
             assert edited.light_power is not None
 
 
@@ -463,6 +467,28 @@ def test_the_colour_that_is_shown_is_the_one_that_was_reached(page):
     assert "#00ff00" in page.props("recipe")["value"]
 
 
+def test_what_a_spectrum_is_like_is_said_in_one_line_a_material_or_that_it_is_like_nothing_known(source):
+    bands = Bands.of([500.0, 600.0, 700.0])
+    materials = Materials(bands, torch.eye(3), torch.zeros(0, 3))
+    sample = LibraryMaterial("set/moss", bands, np.array([0.2, 0.4, 0.1]), "a walk")
+    near = LibraryMaterial("set/lichen", bands, np.array([0.2, 0.41, 0.1]), "a walk")
+    library = MaterialLibrary((sample, near))
+    assert likeness_rows(library, np.array([0.4, 0.8, 0.2]), materials) == [
+        ("like", "set/moss, 0.000 rad"),
+        ("", "set/lichen, 0.010 rad"),
+        ("known from", "a walk"),
+    ]
+    assert likeness_rows(library, np.array([0.4, 0.0, 0.2]), materials) == [
+        ("like", "nothing that is known; nearest is set/moss, 1.061 rad")
+    ]
+    with serving(source) as (viewer, _), opened(viewer) as page:
+        count = len(viewer.services.maker.edited(Edit()).materials.names)
+        (listing,) = [
+            text for text in map(str, page.texts.splitlines()) if "white-space:nowrap;text-overflow" in text
+        ]
+        assert listing.count("title=") == count
+
+
 def test_a_colour_that_is_refused_again_and_again_is_one_notice(viewer, monkeypatch):
     accept, refused = viewer.services.maker.edited, threading.Semaphore(0)
 
@@ -487,7 +513,7 @@ def test_what_a_user_has_to_know_of_an_edit_is_said_once(page):
     page.set("colour", (120, 110, 100))
     page.wait_until(lambda: bool(page.notices))
     recipe = page.props("recipe")
-    for label, value, written in (("brightness", 2.0, "scale"), ("light", "A", "illuminant: A")):
+    for label, value, written in (("brightness", 2.0, "scale"), ("light", "A: light bulb", "illuminant: A")):
         page.set(label, value)
         page.wait_until(lambda written=written: written in recipe["value"])
     show_layer(page, "depth")
@@ -505,7 +531,7 @@ def test_the_axis_of_spectra_says_reflectance_only_in_a_light_of_1(tmp_path):
     with serving(source) as (viewer, _), opened(viewer) as page:
         page.click(0.5, 0.5)
         page.wait_until(lambda: axes(page) == ["reflectance"] * 3)  # of materials, the probe, all probes
-        page.set("light", "A")
+        page.set("light", "A: light bulb")
         page.wait_until(lambda: axes(page) == ["radiance", "reflectance", "reflectance"])
         page.click(0.5, 0.5)  # the first probe keeps its light
         page.wait_until(lambda: axes(page) == ["radiance", "radiance", "radiance or reflectance"])

@@ -35,6 +35,9 @@ LABEL = "unmix-nerf"
 
 _HEAD = """<title>TITLE</title>
 <style>
+  /* Eight tabs fit side by side. */
+  [role="tablist"] { flex-wrap: nowrap !important; overflow-x: auto; scrollbar-width: none }
+  [role="tab"] { padding: 0.6em 0.2em !important; font-size: 0.9em !important; flex: 1 0 auto }
   .uplot:not(:hover) .u-legend .u-value, .uplot:not(:hover) .u-legend .u-label::after { visibility: hidden }
   /* viser's sheet of controls on phones: as wide as the screen, and its head, which folds it, says so. */
   @media (max-width: 36em) {
@@ -53,7 +56,8 @@ _HEAD = """<title>TITLE</title>
     if (head) { watch.disconnect(); head.click(); }
   }).observe(document, {childList: true, subtree: true});
 </script>"""
-"""The title, and what viser's page lacks: charts without dashes for values, and a picture first on phones."""
+"""The title, and what viser's page lacks: tabs in one row, charts without dashes for values, a picture first on
+phones."""
 
 _LARGEST_MESSAGE = 1 << 16
 """Bytes. The longest that a page says is the text of a box."""

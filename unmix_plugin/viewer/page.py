@@ -149,17 +149,19 @@ def bars(entries: Iterable[tuple[str, float, Sequence[float]]]) -> str:
 
 def table(rows: Sequence[tuple[str, str]]) -> str:
     """Names and values side by side."""
+    style = "padding-right:1em;opacity:0.7;white-space:nowrap;vertical-align:top"
     cells = "".join(
-        f'<tr><td style="padding-right:1em;opacity:0.7">{escape(name)}</td><td>{escape(value)}</td></tr>'
-        for name, value in rows
+        f'<tr><td style="{style}">{escape(name)}</td><td>{escape(value)}</td></tr>' for name, value in rows
     )
     return f'<div style="{BLOCK_STYLE}"><table>{cells}</table></div>'
 
 
 def swatches(entries: Sequence[tuple[str, Sequence[float]]]) -> str:
-    """Names below each other, each behind a square of its sRGB colour."""
+    """Names below each other, one line each, behind a square of its sRGB colour."""
+    cut = "overflow:hidden;white-space:nowrap;text-overflow:ellipsis"
     items = "".join(
-        f'{_ROW}<span style="width:0.9em;height:0.9em;background:{css_colour(colour)}"></span>{escape(name)}</div>'
+        f'{_ROW}<span style="flex:none;width:0.9em;height:0.9em;background:{css_colour(colour)}"></span>'
+        f'<span style="{cut}" title="{escape(name)}">{escape(name)}</span></div>'
         for name, colour in entries
     )
     return f'<div style="{BLOCK_STYLE}">{items}</div>'

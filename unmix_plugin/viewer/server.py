@@ -98,6 +98,7 @@ class Viewer:
         self._server, self.port = server, server.get_port()
         server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
         server.gui.set_panel_label(name)
+        server.gui.main_panel.dock_right()  # beside the picture, whose middle is where the object is
         up = up_direction(scene.train_cameras)
         server.scene.set_up_direction(up)
         server.scene.world_axes.visible = False

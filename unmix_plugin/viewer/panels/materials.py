@@ -27,7 +27,7 @@ from unmix_plugin.editing import (
 from unmix_plugin.errors import ConfigError, UnmixError
 from unmix_plugin.formats.files import write_file
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
-from unmix_plugin.spectral.library.material_library import LibraryMaterial, MaterialLibrary
+from unmix_plugin.spectral.library.material_library import LibraryMatch, LibraryMaterial, MaterialLibrary
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.viewer import recipes
 from unmix_plugin.viewer.page import (
@@ -50,33 +50,43 @@ _ALIKE_RAD = 0.1
 """Spectral angle up to which two materials are alike."""
 
 
-def _likenesses(
+def _matches(
     library: MaterialLibrary, spectra: Float[np.ndarray, "N B"], materials: Materials, count: int
-) -> list[list[str]]:
-    """Known materials that spectra resemble in the light of `materials`, with angle and source; those that say little
-    are marked."""
+) -> list[list[LibraryMatch]]:
+    """Known materials that spectra resemble most, by their angle in the light of `materials`."""
     light = None if materials.light is None else materials.light.cpu().double().numpy()
-    return [
-        [
-            f"{one.name} ({one.angle_rad:.3f} rad{'' if one.angle_rad <= _ALIKE_RAD else ', not alike'}; {one.source})"
-            for one in matches
-        ]
-        for matches in library.nearest(spectra, materials.bands, light, count)
-    ]
+    return library.nearest(spectra, materials.bands, light, count)
 
 
 def likeness_rows(
     library: MaterialLibrary, spectrum: Float[np.ndarray, "B"], materials: Materials
 ) -> list[tuple[str, str]]:
-    """Rows of a table of the three known materials that a spectrum resembles most."""
-    (found,) = _likenesses(library, spectrum[None], materials, 3)
-    return [("like" if rank == 0 else "", one) for rank, one in enumerate(found)]
+    """Rows of a table of the known materials, three at most, that a spectrum is like, and of where they are from."""
+    (found,) = _matches(library, spectrum[None], materials, 3)
+    alike = [one for one in found if one.angle_rad <= _ALIKE_RAD]
+    if not alike:
+        nearest = f"; nearest is {found[0].name}, {found[0].angle_rad:.3f} rad" if found else ""
+        return [("like", f"nothing that is known{nearest}")]
+    rows = [
+        ("" if rank else "like", f"{one.name}, {one.angle_rad:.3f} rad") for rank, one in enumerate(alike)
+    ]
+    return [*rows, ("known from", "; ".join(dict.fromkeys(one.source for one in alike)))]
 
 
 _NO_RECIPE = "none saved yet"
 _NO_MATERIAL = "choose one"
 _OWN_LIGHT = "as recorded"
-_COMMON_LIGHTS = ("D65", "D50", "A", "E", "C", "FL2", "FL7", "FL11")
+_COMMON_LIGHTS = {
+    "D65": "daylight at noon",
+    "D50": "warmer daylight, as for prints",
+    "A": "light bulb",
+    "E": "the same at all wavelengths",
+    "C": "daylight, as taken before D65",
+    "FL2": "cool white fluorescent lamp",
+    "FL7": "daylight fluorescent lamp",
+    "FL11": "shop light, in narrow bands",
+}
+"""Names of usual lights, and what they are in words."""
 _FACTORS = (0.0, 5.0, 0.05, 1.0)
 """Least, greatest, step and first of a slider."""
 
@@ -94,7 +104,7 @@ class MaterialsPanel:
         self._named = 0
         gui = session.client.gui
         self._listing = gui.add_html("")
-        self._light = session.on_change(gui.add_dropdown("light", self._lights()), self._change_light)
+        self._light = session.on_change(gui.add_dropdown("light", tuple(self._lights())), self._change_light)
         session.add_buttons("changes", ("undo", "redo", "start again"), self._step)
         names = session.materials().names
         self._chosen = session.on_change(gui.add_dropdown("endmember", names), self._choose)
@@ -190,10 +200,12 @@ class MaterialsPanel:
         self._change_recipe(recipes.with_change(self._recipe, change), (type(change), change.endmember))
 
     def _change_light(self) -> None:
-        name, recipe = str(self._light.value), self._recipe
-        if name not in self._lights(recipe.illuminant):
-            raise ConfigError(f"there is no light {name[:40]!r} to choose")
-        self._change_recipe(replace(recipe, illuminant=None if name == _OWN_LIGHT else Light(name)))
+        title, recipe = str(self._light.value), self._recipe
+        lights = self._lights(recipe.illuminant)
+        if title not in lights:
+            raise ConfigError(f"there is no light {title[:40]!r} to choose")
+        name = lights[title]
+        self._change_recipe(replace(recipe, illuminant=None if name is None else Light(name)))
 
     def _change_visible(self) -> None:
         hidden, index = recipes.named_by(self._recipe, Remove), {self._index}
@@ -260,10 +272,15 @@ class MaterialsPanel:
         lines = [Line(*one) for one in zip(materials.names, spectra, colours, strict=True)]
         self._chart.draw(materials.bands.centers_nm, lines, materials.quantity)
         entries = []
-        for index, like in enumerate(_likenesses(self._library, spectra[:_LONGEST_LIST], materials, 1)):
+        for index, found in enumerate(_matches(self._library, spectra[:_LONGEST_LIST], materials, 1)):
             hidden = "" if recipes.is_shown(self._recipe, index) else " (hidden)"
-            said = "".join(f", like {one}" for one in like)
-            entries.append((f"{materials.names[index]}{hidden}{said}", colours[index]))
+            like = [one.name.rpartition("/")[2] for one in found if one.angle_rad <= _ALIKE_RAD]
+            entries.append(
+                (
+                    f"{materials.names[index]}{hidden}{''.join(f', like {one}' for one in like)}",
+                    colours[index],
+                )
+            )
         self._listing.content = swatches(entries)
         self._show_chosen(materials)
 
@@ -286,18 +303,25 @@ class MaterialsPanel:
             # While a name is typed the field is the user's: "blue " may become "blue cloth".
             if not self._typed_name.is_waiting and text(self._name.value).strip() != materials.names[index]:
                 self._name.value = materials.names[index]
-            self._light.options = self._lights(recipe.illuminant)
-            self._light.value = _OWN_LIGHT if recipe.illuminant is None else str(recipe.illuminant.light)
+            lights = self._lights(recipe.illuminant)
+            present = None if recipe.illuminant is None else str(recipe.illuminant.light)
+            self._light.options = tuple(lights)
+            self._light.value = next(title for title, name in lights.items() if name == present)
             spectrum = materials.endmembers[index].double().cpu().numpy()
             self._alike.content = table(likeness_rows(self._library, spectrum, materials))
             self._text.value = recipe_to_yaml(recipe)
 
-    def _lights(self, present: Light | None = None) -> tuple[str, ...]:
-        """Lights to choose from: those that reach the bands, usual ones first, and the present one in any case."""
+    def _lights(self, present: Light | None = None) -> dict[str, str | None]:
+        """Lights to choose from, by how the menu has them: the recorded one, those that reach the bands, usual ones
+        first, and the present one in any case."""
         usable = self._session.services.usable_lights
-        common = [name for name in _COMMON_LIGHTS if name in usable]
-        shown = [] if present is None else [str(present.light)]
-        return tuple(dict.fromkeys([_OWN_LIGHT, *common, *usable, *shown]))
+        names = [name for name in _COMMON_LIGHTS if name in usable]
+        names += [*usable, *([] if present is None else [str(present.light)])]
+        titles = {
+            f"{name}: {_COMMON_LIGHTS[name]}" if name in _COMMON_LIGHTS else name: name
+            for name in dict.fromkeys(names)
+        }
+        return {_OWN_LIGHT: None, **titles}
 
 
 def _srgb(value: Any) -> tuple[float, float, float]:
