@@ -60,7 +60,7 @@ def check_pose_options(options: ProcessOptions, capture: Capture) -> None:
     if (options.angles is None) == (options.poses == TURNTABLE):
         raise ConfigError(f"--poses {TURNTABLE} and --angles go together, such as --angles 0:360:10")
     if options.angles is not None:
-        parse_angles(options.angles, [view.name for view in capture.views])
+        parse_angles(options.angles, capture.names)
     if options.poses in (MARKERS, TURNTABLE) or options.marker_size is not None:
         require_opencv()
     if options.poses == ESTIMATE:
@@ -114,8 +114,8 @@ def poses_of_written_views(
     elif len(plan.sensors) > 1:
         raise CaptureError(f"--poses {TURNTABLE} knows one camera; process the views of one lens alone")
     else:
-        turns = parse_angles(options.angles or "", [view.name for view in plan.capture.views])
-        poses = poses_from_turntable(pictures, turns, masks)
+        turns = parse_angles(options.angles or "", plan.capture.names)
+        poses = poses_from_turntable(pictures, {name: turns[name] for name in pictures}, masks)
     if options.marker_size is not None:
         sightings, notes = _sightings(plan, options)
         poses = metric_poses(poses, sightings, options.marker_size)

@@ -93,6 +93,10 @@ class ProcessOptions:
     """Stored number from which a pixel is saturated; without it, found from the values."""
     scale: float | None = None
     """Calibrated value that is written as 1; without it, found from the values."""
+    leave_out: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME...")] = ()
+    """Views to leave out, by name."""
+    keep_view: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME...")] = ()
+    """Views to keep although they look spoilt: black, overexposed, blurred, with another view's pose."""
     overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Replace a scene that this command made in the output folder."""
 

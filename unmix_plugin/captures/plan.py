@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,7 +24,7 @@ from unmix_plugin.captures.calibration.sensor import (
 )
 from unmix_plugin.captures.camera_tags import radiometric_model
 from unmix_plugin.captures.options import MaskKind, ProcessOptions, plain_options
-from unmix_plugin.captures.poses.pose_set import reading
+from unmix_plugin.captures.poses.pose_set import PosedCamera, reading
 from unmix_plugin.captures.report import Code, Kind, Remark, sentences
 from unmix_plugin.captures.spectral_file import Capture, CaptureView, SpectralFile
 from unmix_plugin.captures.writing.view_files import BackgroundRule, ViewRecipe, alpha_picture
@@ -77,6 +77,8 @@ class Plan:
     """What may make values, wavelengths or geometry wrong, one sentence each."""
     option_files: tuple[Path, ...] = ()
     """What options name: dark frame, white reference, tables of its reflectance and of wavelengths."""
+    left_out: Mapping[str, Remark] = field(default_factory=dict)
+    """Views that nothing was decided from, as they are spoilt, and why."""
 
     def fingerprint(self, options: ProcessOptions) -> dict[str, Any]:
         """What must be the same for views to be gone on with: options, decisions and input files."""
@@ -105,12 +107,14 @@ def make_plan(
     views: Sequence[CaptureView],
     options: ProcessOptions,
     references: tuple[SpectralFile | None, SpectralFile | None],
+    cameras: Mapping[str, PosedCamera] | None = None,
 ) -> Plan:
     """Look at some rows of every view and decide.
 
     Args:
         views: Those of the capture that become frames.
         references: Dark frame and white reference that the user names.
+        cameras: By view, if they are known.
     Raises:
         CaptureError: views don't fit each other or the references, or a file can't be read.
         ConfigError: an option does not fit the files.
@@ -124,14 +128,16 @@ def make_plan(
     for name, same in by_sensor.items():
         # Views of several sizes are several sensors, and one may show the panel of all.
         every = [v for v in capture.views if v.sensor == name or not (name and v.release)]
-        sensors[name] = prepare_sensor(same, options, references, every)
+        sensors[name] = prepare_sensor(same, options, references, every, cameras)
     sensors = _with_one_exposure(sensors, {name: same[0].cube for name, same in by_sensor.items()})
+    left_out = {name: remark for sensor in sensors.values() for name, remark in sensor.left_out.items()}
+    sound = {name: [view for view in same if view.name not in left_out] for name, same in by_sensor.items()}
     scale, why = _choose_scale(list(sensors.values()), options.scale)
     mask, said_of_mask = _choose_mask(views, options.mask)
     samples = {name: sensor.sample / np.float32(scale) for name, sensor in sensors.items()}
     backdrops: dict[str, Backdrop | None] = {}
     if mask == "auto":
-        backdrops = {n: _find_backdrop(s, by_sensor[n], scale, samples[n]) for n, s in sensors.items()}
+        backdrops = {n: _find_backdrop(s, sound[n], scale, samples[n]) for n, s in sensors.items()}
         if not all(backdrops.values()):  # frames with alpha and without don't go together
             backdrops, mask = {}, "none"
     recipes: dict[str, ViewRecipe] = {}
@@ -144,7 +150,7 @@ def make_plan(
         to_rgb = to_rgb / np.float32(white) if white > 0 else to_rgb
         rule: BackgroundRule | Backdrop | None = backdrops.get(name)
         if mask in ("white", "black"):
-            rule = _background_rule(mask, _border_pixels(sensor, by_sensor[name], scale), samples[name])
+            rule = _background_rule(mask, _border_pixels(sensor, sound[name], scale), samples[name])
         recipes[name] = ViewRecipe(sensor.calibration, scale, to_rgb, rule, mask == "files")
         evidence[name or "all views"] = {
             "unit": sensor.unit,
@@ -191,6 +197,7 @@ def make_plan(
         (*capture.notes, *said),
         (*capture.warnings, *warned, *_warnings_of_files(each)),
         (*(path for file in opened for path in file.files), *map(Path, tables)),
+        left_out,
     )
 
 
@@ -213,7 +220,7 @@ def _with_one_exposure(sensors: dict[str, Sensor], first: dict[str, SpectralFile
     ]
     if len(bare) < 2 or not files:
         return sensors
-    is_bent, is_finished = any(map(is_srgb, files)), any(map(may_be_reflectance, files))
+    is_bent, is_finished = any(map(is_srgb, files)), any(may_be_reflectance([file]) for file in files)
     compared = compare_exposures(ExposedFiles(files, is_srgb=is_bent, may_be_reflectance=is_finished))
     common = compared.common
     remarks = [one for one in compared.remarks if one.code.looks_wrong or known or common is None]
@@ -270,7 +277,7 @@ def _choose_scale(sensors: Sequence[Sensor], given: float | None) -> tuple[float
         if not (np.isfinite(given) and given > 0):
             raise ConfigError(f"--scale {given:g}: expected a number above 0, what is written as 1")
         return given, "given with --scale"
-    values = np.concatenate([sensor.sample.ravel() for sensor in sensors])
+    values = np.concatenate([sensor.usual_sample.ravel() for sensor in sensors])
     bright = float(np.percentile(values, BRIGHT_PERCENTILE)) if len(values) else 0.0
     if not bright > 0:
         raise CaptureError(

@@ -6,7 +6,7 @@ import json
 import os
 import re
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from unmix_plugin.captures.options import LAYOUTS, ProcessOptions, find_views
 from unmix_plugin.captures.plan import Plan, hashes, input_files, make_plan
 from unmix_plugin.captures.poses.estimation import WORK_FILES
 from unmix_plugin.captures.poses.lens import Lens
+from unmix_plugin.captures.poses.pose_set import PosedCamera
 from unmix_plugin.captures.posing import (
     FROM_PICTURES,
     MARKERS,
@@ -28,12 +29,14 @@ from unmix_plugin.captures.posing import (
     pose_views,
 )
 from unmix_plugin.captures.readers.opening import open_spectral_file
+from unmix_plugin.captures.report import Code, Remark
 from unmix_plugin.captures.spectral_file import (
     Capture,
     CaptureView,
     ReadOptions,
     SpectralFile,
 )
+from unmix_plugin.captures.spoilt import UnreadableViews, judge_sharpness
 from unmix_plugin.captures.wavelengths import parse_wavelengths
 from unmix_plugin.captures.writing.resampling import Resampling
 from unmix_plugin.captures.writing.scene_files import RECORD_NAME, write_scene_files
@@ -80,16 +83,18 @@ def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list
     say(f"{capture.root}: {len(capture.views)} views of the layout {capture.layout}")
     check_pose_options(options, capture)
     known = asked_distance(options, capture.views)
+    wanted, left_out = _wanted_views(capture, options)
     posed = None
     if options.poses not in FROM_PICTURES:
-        posed = pose_views(capture.views, given_poses(capture, options.poses), known)
-    views = capture.views if posed is None else posed.views
-    plan = make_plan(capture, views, options, references)
+        posed = pose_views(wanted, given_poses(capture, options.poses), known)
+    cameras = None if posed is None else posed.poses.cameras
+    plan = make_plan(capture, wanted if posed is None else posed.views, options, references, cameras)
     for note in plan.notes:
         say(f"note: {note}")
+    left_out |= plan.left_out
     if options.poses == MARKERS:
         say("looking for markers ...")
-        posed = pose_views(plan.views, marked_poses(plan, options), known)
+        posed = pose_views(_without(plan.views, left_out), marked_poses(plan, options), known)
     require_apart(
         (folder.output, folder.path),
         [("the capture's", path) for view in capture.views for path in input_files(view)],
@@ -99,29 +104,94 @@ def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list
         {**plan.fingerprint(options), "lenses": sorted(numbers for _, numbers in resampled.values())}
     ):
         say(f"going on with {folder.path}")
-    records: dict[str, ViewRecord] = {}
-    for view in follow("writing views", plan.views if posed is None else posed.views):
-        record = folder.done(view.name)
-        if record is None:
-            into = Resampling.into(resampled[view.name][0]) if view.name in resampled else None
-            record = write_view(view, plan.recipes[view.sensor], folder.path, into)
-            record = replace(record, sources=hashes(input_files(view)))
-            folder.note(record)
-        records[view.name] = record
-    if all(record.matter_share == 0.0 for record in records.values()):
+    lenses = {name: lens for name, (lens, _) in resampled.items()}
+    views = follow("writing views", plan.views if posed is None else posed.views)
+    records, unreadable = _write_views(views, plan, lenses, folder)
+    left_out |= unreadable
+    left_out |= _blurred(plan, records, cameras, {*left_out, *options.keep_view})
+    sound = {name: record for name, record in records.items() if name not in left_out}
+    if all(record.matter_share == 0.0 for record in sound.values()):
         raise CaptureError(
             f"{capture.root}: no view shows anything but background, by its mask ({plan.mask}); look at "
             f"{folder.path / 'images'} and choose another --mask, or none"
         )
     if posed is None:
         say("estimating poses ...")
-        found = poses_of_written_views(plan, records, folder.path, folder.poses, options)
-        posed = pose_views(plan.views, found, known)
+        found = poses_of_written_views(plan, sound, folder.path, folder.poses, options)
+        posed = pose_views(_without(plan.views, left_out), found, known)
         _refuse_late(_resampled_lenses(plan, posed))
     for note in posed.notes:
         say(f"poses: {note}")
-    findings = write_scene_files(folder.path, plan, posed, records, options)
+    posed = replace(posed, views=tuple(_without(posed.views, left_out)))
+    findings = write_scene_files(folder.path, plan, posed, records, options, [*left_out.values()])
     return [*findings, *folder.finish(options.overwrite)]
+
+
+def _write_views(
+    views: Iterable[CaptureView], plan: Plan, lenses: Mapping[str, Lens], folder: _WorkFolder
+) -> tuple[dict[str, ViewRecord], dict[str, Remark]]:
+    """Write the files of all views that are not there yet, brought into other lenses where there are such; and say
+    which can't be read, by name. Raises CaptureError: too many can't be."""
+    records: dict[str, ViewRecord] = {}
+    unreadable = UnreadableViews(len(plan.views))
+    for view in views:
+        record = folder.done(view.name)
+        if record is None:
+            into = Resampling.into(lenses[view.name]) if view.name in lenses else None
+            with unreadable.noted(view.name):
+                record = write_view(view, plan.recipes[view.sensor], folder.path, into)
+                record = replace(record, sources=hashes(input_files(view)))
+                folder.note(record)
+        if record is not None:
+            records[view.name] = record
+    return records, _said_of_unreadable(unreadable.found)
+
+
+def _without(views: Iterable[CaptureView], left_out: Collection[str]) -> list[CaptureView]:
+    return [view for view in views if view.name not in left_out]
+
+
+def _wanted_views(capture: Capture, options: ProcessOptions) -> tuple[list[CaptureView], dict[str, Remark]]:
+    """The views that can be read and that the user does not leave out, and why others are left out. Raises ConfigError:
+    the user names one that is not there. Raises CaptureError: too many can't be read."""
+    names = capture.names
+    for flag, asked in (("--leave-out", options.leave_out), ("--keep-view", options.keep_view)):
+        for name in asked:
+            if name not in names:
+                hint = did_you_mean(name, names, form="; {}")
+                raise ConfigError(
+                    f"{flag} {name}: no view of this name; there are {name_some(names, 5)}{hint}"
+                )
+    left_out = _said_of_unreadable(capture.unreadable)
+    unreadable = UnreadableViews(len(names))
+    wanted = _without(capture.views, options.leave_out)
+    for view in wanted:
+        with unreadable.noted(view.name):
+            for row in {0, view.cube.shape[0] // 2, view.cube.shape[0] - 1}:
+                view.cube.read(slice(row, row + 1))
+    left_out |= _said_of_unreadable(unreadable.found)
+    left_out |= {name: Remark.of(Code.VIEW_NOT_WANTED, [name]) for name in options.leave_out}
+    return _without(wanted, left_out), left_out
+
+
+def _said_of_unreadable(found: Iterable[tuple[str, str]]) -> dict[str, Remark]:
+    return {name: Remark.of(Code.VIEW_UNREADABLE, [name], why=why) for name, why in found}
+
+
+def _blurred(
+    plan: Plan,
+    records: Mapping[str, ViewRecord],
+    cameras: Mapping[str, PosedCamera] | None,
+    known: Collection[str],
+) -> dict[str, Remark]:
+    """Views that are blurred, among those of which nothing else is `known`."""
+    found: dict[str, Remark] = {}
+    for sensor in plan.sensors:
+        own = {
+            name: one for name, one in records.items() if one.sensor == sensor and name not in plan.left_out
+        }
+        found |= judge_sharpness({name: one.sharpness for name, one in own.items()}, cameras)
+    return {name: remark for name, remark in found.items() if name not in known}
 
 
 def _resampled_lenses(plan: Plan, posed: PosedViews) -> dict[str, tuple[Lens, list[float]]]:

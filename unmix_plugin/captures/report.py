@@ -47,6 +47,30 @@ class Code(Enum):
     CAPTURE_WARNING = _wrong("{text}")
     """Of a layout or a source of poses, which has no code of its own for it."""
 
+    # Views that are left out.
+    VIEW_BLACK = _wrong(
+        "{where} is left out: it shows nothing, its brightness is {share} of the usual one; --keep-view {where} "
+        "takes it back"
+    )
+    VIEW_OVEREXPOSED = _wrong(
+        "{where} is left out: it is overexposed, {share} of what it shows is saturated and the rest is {times} "
+        "times as bright as in the views around it; --keep-view {where} takes it back"
+    )
+    VIEW_EXPOSED_OTHERWISE = _wrong(
+        "{where} is left out: it is {times} times as bright as the views around it, in all bands, from dark to "
+        "bright: exposed otherwise than its file says; --keep-view {where} takes it back"
+    )
+    VIEW_BLURRED = _wrong(
+        "{where} is left out: it is blurred, with {share} of the fine contrast of the views around it; --keep-view "
+        "{where} takes it back"
+    )
+    VIEW_OF_OTHER_POSE = _wrong(
+        "{where} is left out: its picture does not fit its pose ({miss_px:.0f} px off, {usual_px:.1f} px are usual): "
+        "is it that of another view? --keep-view {where} takes it back"
+    )
+    VIEW_UNREADABLE = _wrong("{where} is left out, as its file can't be read: {why}")
+    VIEW_NOT_WANTED = _done("{where} is left out, as --leave-out says")
+
     # Exposures.
     EXPOSURE_COUNTED_BEFORE = _done(
         "views were exposed {exposed} {unit}: values are not divided by that, as {source} says that they are "

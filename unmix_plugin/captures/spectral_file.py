@@ -19,6 +19,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int, Shaped
 
+from unmix_plugin.captures.names import natural_order
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.pose_set import PoseSet
 from unmix_plugin.errors import CaptureError, install_hint
@@ -385,3 +386,12 @@ class Capture:
     """What is odd about the folder, one sentence each."""
     warnings: tuple[str, ...] = ()
     """What may make values, wavelengths or geometry wrong, one sentence each: reports begin with it."""
+    unreadable: tuple[tuple[str, str], ...] = ()
+    """Names of views whose files can't be opened, and why."""
+
+    @property
+    def names(self) -> list[str]:
+        """Of all views, those that can't be opened too, in their order."""
+        return sorted(
+            [*(view.name for view in self.views), *(name for name, _ in self.unreadable)], key=natural_order
+        )

@@ -7,8 +7,8 @@ Notation: `N` sampled pixels, `B` bands of the file, `c` bands of the scene.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -29,8 +29,10 @@ from unmix_plugin.captures.calibration.references import (
 )
 from unmix_plugin.captures.camera_tags import radiometric_model
 from unmix_plugin.captures.options import ProcessOptions
+from unmix_plugin.captures.poses.pose_set import PosedCamera
 from unmix_plugin.captures.report import Code, Remark
 from unmix_plugin.captures.spectral_file import MOST_WIDTH, BandIndex, CaptureView, SpectralFile
+from unmix_plugin.captures.spoilt import ViewPixels, judge_values
 from unmix_plugin.captures.wavelengths import in_ranges
 from unmix_plugin.errors import CaptureError
 
@@ -59,6 +61,9 @@ and above which a range was left out: one band that is left out makes two steps 
 _LEAST_WHITE = 0.01
 """Signal of the white reference in a band, as a share of the greatest, below which the band is too dark."""
 BRIGHT_PERCENTILE, _FEW_PERCENTILE = 99.9, 5.0
+_FAR_BRIGHTER, _LEAST_COMPARED, _MOST_USUAL = 1.5, 4, 0.75
+"""Bright pixels of a view over those of most views, from which the scale does not follow it; views that it takes; and
+the share of them that must not be so."""
 _MOST_REFLECTANCE = 1.5
 """Of bright pixels with highlights."""
 
@@ -143,12 +148,21 @@ class Sensor:
     lamp: Float64[np.ndarray, " c"] | None = None
     """Light on the white panel as the detector sees it, greatest value 1."""
     remarks: tuple[Remark, ...] = ()
+    left_out: Mapping[str, Remark] = field(default_factory=dict)
+    """Views that nothing was decided from, as they are spoilt, and why."""
+    is_usual: Bool[np.ndarray, " N"] | None = None
+    """Sampled pixels of views that are not far brighter than most; None if all are."""
     is_stated: bool = False
     """Whether a white reference or the files say what 1 is, which dividing values loses."""
     is_reflectance: bool = False
     """Whether values are reflectances, of which 1 is a white: by a white reference, or as the files say."""
     saturated_from: float = np.inf
     """Calibrated value of nearly the darkest of sampled numbers that are saturated."""
+
+    @property
+    def usual_sample(self) -> Float32[np.ndarray, "M c"]:
+        """The sample without views that are far brighter than most."""
+        return self.sample if self.is_usual is None else self.sample[self.is_usual]
 
     @property
     def centers_nm(self) -> Float64[np.ndarray, " c"]:
@@ -161,6 +175,7 @@ def prepare_sensor(
     options: ProcessOptions,
     references: tuple[SpectralFile | None, SpectralFile | None],
     all_views: Sequence[CaptureView],
+    cameras: Mapping[str, PosedCamera] | None = None,
 ) -> Sensor:
     """Look at some rows of every view and decide how they are calibrated.
 
@@ -168,6 +183,7 @@ def prepare_sensor(
         views: At least one; all have the same bands and size.
         references: Dark frame and white reference that the user names.
         all_views: With those that have no pose: one may show a panel.
+        cameras: By view, if they are known.
     Raises:
         CaptureError: references don't fit, wavelengths are unknown, no band is left, or a file can't be read.
         ConfigError: an option does not fit the files.
@@ -199,13 +215,17 @@ def prepare_sensor(
             darks += [(its_dark.file, file)] if its_dark else []
             darks += [(used.dark.file, used.file)] if used and used.dark else []
         of_whites = [one.file for one in whites]
-        exposed = ExposedFiles(files, of_whites, darks, is_srgb(first), may_be_reflectance(first))
+        exposed = ExposedFiles(files, of_whites, darks, is_srgb(first), may_be_reflectance(files))
         compared = compare_exposures(exposed)
         exposure = compared.common
         remarks += compared.remarks
     raster = Raster.of(first.shape[0], first.shape[1], options.crop, options.bin_pixels)
     calibration = Calibration(raster, choice.kept, 1, dark, white, saturation, exposure, own)
-    sample = _draw_sample(files, calibration)
+    drawn = _draw_sample(views, calibration)
+    spoilt = judge_values(drawn, cameras)
+    left_out = {name: remark for name, remark in spoilt.items() if name not in options.keep_view}
+    drawn = [view for view in drawn if view.name not in left_out]
+    sample = _pooled(drawn, first)
     choice = _drop_found(choice, sample, options.max_noise, remarks)
     choice = choice.without_incomplete_bins(binning)
     choice.require(binning, str(first.path))
@@ -231,19 +251,27 @@ def prepare_sensor(
         evidence | _evidence(views, choice, (dark, white), own),
         lamp,
         tuple(remarks),
+        left_out,
+        _of_usual_views(drawn, still_kept),
         bool(whites) or states_one,
         bool(whites) or (has_one and finished is not None),
         float(np.percentile(at_end, _FEW_PERCENTILE)) if len(at_end) else np.inf,
     )
 
 
-def may_be_reflectance(file: SpectralFile) -> bool:
-    """Whether the values of sampled rows were brought to what stands for 1, perhaps."""
-    if file.dtype.kind != "f" and file.linear is None:
+def may_be_reflectance(files: Sequence[SpectralFile]) -> bool:
+    """Whether the values of sampled rows of most of some files were brought to what stands for 1, perhaps."""
+    if files[0].dtype.kind != "f" and files[0].linear is None:
         return False
-    parts = [(_stored_pixels(file, row)[None], slice(row, row + 1)) for row in sampled_rows(file.shape[0])]
-    values = np.concatenate([stated_values(file, *part).ravel() for part in parts])
-    return len(values) > 0 and bool(0.0 < np.percentile(values, BRIGHT_PERCENTILE) <= _MOST_REFLECTANCE)
+    bright = []
+    for index in np.unique(np.linspace(0, len(files) - 1, min(len(files), _MOST_ALIKE + 1)).astype(int)):
+        file = files[index]
+        parts = [
+            (_stored_pixels(file, row)[None], slice(row, row + 1)) for row in sampled_rows(file.shape[0])
+        ]
+        values = np.concatenate([stated_values(file, *part).ravel() for part in parts])
+        bright += [float(np.percentile(values, BRIGHT_PERCENTILE))] if len(values) else []
+    return len(bright) > 0 and 0.0 < float(np.median(bright)) <= _MOST_REFLECTANCE
 
 
 def _stated_bands(files: Sequence[SpectralFile], options: ProcessOptions) -> _BandChoice:
@@ -401,26 +429,46 @@ _Sample: TypeAlias = tuple[Float32[np.ndarray, "N B"], Bool[np.ndarray, "N B"]]
 """Calibrated pixels of all views of a sensor, and which numbers are saturated."""
 
 
-def _draw_sample(files: Sequence[SpectralFile], calibration: Calibration) -> _Sample:
-    """Pixels on the sampled rows, evenly spaced along them, at all bands that the calibration keeps."""
+def _draw_sample(views: Sequence[CaptureView], calibration: Calibration) -> list[ViewPixels]:
+    """Pixels on the sampled rows of each view, evenly spaced along them, at all bands that the calibration keeps."""
     raster = calibration.raster
     rows = sampled_rows(raster.height)
-    step = max(1, len(files) * len(rows) * raster.width // _MOST_PIXELS)
-    values, saturated = [], []
-    for file, row in product(files, rows):
-        part = calibration.rows(file, row, row + 1)
-        keep = np.zeros(raster.width, bool)
-        keep[row % step :: step] = True
-        keep &= ~part.missing[0]
-        values.append(part.values[0][keep])
-        saturated.append(part.saturated[0][keep])
-    sample = np.concatenate(values), np.concatenate(saturated)
+    step = max(1, len(views) * len(rows) * raster.width // _MOST_PIXELS)
+    drawn = []
+    for view in views:
+        parts = [calibration.rows(view.cube, row, row + 1) for row in rows]
+        kept = np.zeros((len(rows), raster.width), bool)
+        for index, row in enumerate(rows):
+            kept[index, row % step :: step] = True
+        kept &= ~np.concatenate([part.missing for part in parts])
+        values, saturated = (
+            np.concatenate([getattr(part, name) for part in parts])[kept] for name in ("values", "saturated")
+        )
+        drawn.append(ViewPixels(view.name, values, saturated))
+    return drawn
+
+
+def _pooled(drawn: Sequence[ViewPixels], first: SpectralFile) -> _Sample:
+    """The pixels of all views. Raises CaptureError: there are none."""
+    sample = np.concatenate([one.values for one in drawn]), np.concatenate([one.saturated for one in drawn])
     if not len(sample[0]):
         raise CaptureError(
-            f"{files[0].path}: no sampled pixel of it and of the other views has a measurement in all bands (NaN, "
+            f"{first.path}: no sampled pixel of it and of the other views has a measurement in all bands (NaN, "
             "no-data, or no light on the white panel); check these, or leave bands out with --drop-bands"
         )
     return sample
+
+
+def _of_usual_views(
+    drawn: Sequence[ViewPixels], bands: Bool[np.ndarray, " B"]
+) -> Bool[np.ndarray, " N"] | None:
+    """Which pixels are of views whose bright pixels are not far brighter than those of most."""
+    values = [one.values[:, bands] for one in drawn]
+    bright = [np.percentile(one, BRIGHT_PERCENTILE) if one.size else np.nan for one in values]
+    is_usual = ~(np.array(bright) > _FAR_BRIGHTER * np.nanmedian(bright))
+    if is_usual.all() or len(drawn) < _LEAST_COMPARED or is_usual.mean() < _MOST_USUAL:
+        return None
+    return np.repeat(is_usual, [len(one) for one in values])
 
 
 def _drop_found(choice: _BandChoice, sample: _Sample, max_noise: float, remarks: list[Remark]) -> _BandChoice:

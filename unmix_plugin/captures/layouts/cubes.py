@@ -26,6 +26,7 @@ from unmix_plugin.captures.names import natural_order, view_names
 from unmix_plugin.captures.readers.envi import described_image, header_beside
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import Capture, CaptureView, ReadOptions, SpectralFile
+from unmix_plugin.captures.spoilt import UnreadableViews
 from unmix_plugin.errors import CaptureError, name_some
 from unmix_plugin.formats.files import safe_name
 
@@ -80,8 +81,10 @@ def find_cubes(root: Path, options: ReadOptions) -> Capture:
         raise CaptureError(
             f"{root} holds no cubes; expected one file a view ({kinds}), or one folder of band files a view"
         )
-    views = _open_views(_names(shown), shown, [{}] * len(shown), files if folders else [], options)
-    return Capture("cubes", root, views)
+    views, unreadable = _open_views(
+        _names(shown), shown, [{}] * len(shown), files if folders else [], options
+    )
+    return Capture("cubes", root, views, unreadable=unreadable)
 
 
 def _open_views(
@@ -90,17 +93,19 @@ def _open_views(
     references: Sequence[dict[str, Path]],
     files: Sequence[Path],
     options: ReadOptions,
-) -> tuple[CaptureView, ...]:
+) -> tuple[tuple[CaptureView, ...], tuple[tuple[str, str], ...]]:
     """Views in the order of their names, each with references of its own by their kind, and the picture among the files
-    that lies beside it."""
+    that lies beside it; and those that can't be opened, with the reason. Raises CaptureError: those are too many."""
     shown = [path for path in files if path.suffix.lower() in _PICTURE_SUFFIXES]
     pictures, views = {path.with_name(_stem(path)): path for path in shown}, []
+    unreadable = UnreadableViews(len(paths))
     for name, path, own in zip(names, paths, references, strict=True):
         plain = replace(options, wavelengths_nm=None)
-        opened = {kind: open_spectral_file(reference, plain) for kind, reference in own.items()}
-        view = CaptureView(name, _open(path, options), picture=pictures.get(path.with_name(_stem(path))))
-        views.append(replace(view, **opened))
-    return tuple(sorted(views, key=lambda view: natural_order(view.name)))
+        with unreadable.noted(name):
+            opened = {kind: open_spectral_file(reference, plain) for kind, reference in own.items()}
+            view = CaptureView(name, _open(path, options), picture=pictures.get(path.with_name(_stem(path))))
+            views.append(replace(view, **opened))
+    return tuple(sorted(views, key=lambda view: natural_order(view.name))), unreadable.found
 
 
 def _capture_of_groups(root: Path, folders: dict[Path, list[Path]], options: ReadOptions) -> Capture:
@@ -130,7 +135,7 @@ def _capture_of_groups(root: Path, folders: dict[Path, list[Path]], options: Rea
         for group, kind in zip(complete.values(), kinds, strict=True)
     ]
     there = [path for folder in folders for path in _visible_files(folder)]
-    views = _open_views(names, paths, own, there, options)
+    views, unreadable = _open_views(names, paths, own, there, options)
     counts = Counter(reference for references in own for reference in references)
     notes = [
         f"{counts[kind]} of {len(views)} views have a {what}, which is used{' for all' * (counts[kind] == 1)} unless "
@@ -145,7 +150,7 @@ def _capture_of_groups(root: Path, folders: dict[Path, list[Path]], options: Rea
         notes.append(f"left out, as named like references: {named}; use one with --white or --dark")
     lost = [path.name for path in there if path.suffix.lower() in _NUMBERS and header_beside(path) is None]
     warnings = (f"left out, as no header beside them says what they hold: {name_some(lost)}",) if lost else ()
-    return Capture("cubes", root, views, notes=tuple(notes), warnings=warnings)
+    return Capture("cubes", root, views, notes=tuple(notes), warnings=warnings, unreadable=unreadable)
 
 
 def _sort_into(

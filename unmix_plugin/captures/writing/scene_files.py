@@ -25,7 +25,7 @@ from unmix_plugin.captures.options import ProcessOptions, plain_options
 from unmix_plugin.captures.plan import Plan, hashes
 from unmix_plugin.captures.poses.pose_set import PoseSet
 from unmix_plugin.captures.posing import PosedViews
-from unmix_plugin.captures.report import report_text
+from unmix_plugin.captures.report import Kind, Remark, report_text, sentences
 from unmix_plugin.captures.spectral_file import CaptureView
 from unmix_plugin.captures.value_checks import ViewSample, check_files, check_values
 from unmix_plugin.captures.writing.view_files import FULL_SCALE, BackgroundRule, ViewRecord
@@ -47,10 +47,18 @@ _MOST_BANDS = 8
 
 
 def write_scene_files(
-    folder: Path, plan: Plan, posed: PosedViews, records: dict[str, ViewRecord], options: ProcessOptions
+    folder: Path,
+    plan: Plan,
+    posed: PosedViews,
+    records: dict[str, ViewRecord],
+    options: ProcessOptions,
+    left_out: Sequence[Remark] = (),
 ) -> list[str]:
     """Write transforms.json, light, points, contact sheet, report and record.
 
+    Args:
+        records: Of the views that are written, with some that are left out.
+        left_out: Why views are left out, one each.
     Returns:
         What looks wrong, one sentence each.
     Raises:
@@ -66,7 +74,8 @@ def write_scene_files(
     # Views of sensors with other bands can't be compared with those of the one that took the most.
     ((greatest, _),) = Counter(view.record.sensor for view in seen).most_common(1)
     alike = {name for name, sensor in plan.sensors.items() if _has_bands_of(sensor, plan.sensors[greatest])}
-    findings = [*dict.fromkeys((*plan.warnings, *posed.poses.warnings))]
+    findings = sentences(left_out, Kind.WRONG)
+    findings += dict.fromkeys((*plan.warnings, *posed.poses.warnings))
     measured = check_views([v for v in seen if v.record.sensor in alike], posed.poses.points, findings)
     findings += posed.findings
     check_files(posed.views, options, findings)
@@ -77,9 +86,11 @@ def write_scene_files(
     same = [view for view in seen if view.record.sensor == greatest]
     measured.append(check_matches([(v.camera, v.picture) for v in same], angles_between(same), findings))
     title = f"{plan.capture.root}: {len(seen)} views, {_sizes_in_words(plan)}"
-    done = _what_was_done(plan, posed, [view.record for view in seen])
+    done = sentences(left_out, Kind.DONE) + _what_was_done(plan, posed, [view.record for view in seen])
+    reasons = {remark.where[0]: remark for remark in left_out}
+    spoilt = [record for name, record in records.items() if name in reasons]
     write_file(folder / _REPORT_NAME, terminal_text(report_text(title, findings, measured, done)).encode())
-    write_file(folder / _SHEET_NAME, _contact_sheet(seen, plan.sensors, posed.poses, title))
+    write_file(folder / _SHEET_NAME, _contact_sheet(seen, plan.sensors, posed.poses, title, spoilt))
     views = [asdict(view.record) for view in seen]
     totals = ("num_pixels", "saturated_pixels", "missing_pixels", "clipped_values", "negative_values")
     record = {
@@ -90,14 +101,28 @@ def write_scene_files(
         "poses": {"source": posed.poses.source, "notes": list(posed.notes), **posed.keys},
         "notes": list(plan.notes),
         "what_looks_wrong": findings,
+        "left_out": [remark.to_json() for remark in left_out],
         "measured": measured,
         "totals": {key: sum(view[key] for view in views) for key in totals},
         "references": hashes(plan.option_files),
         "views": views,
     }
     _write_json(folder / RECORD_NAME, record)
-    _write_json(folder / _SCENE_NAME, _transforms_json(plan, posed.views, seen, keys))
+    _write_json(
+        folder / _SCENE_NAME,
+        _transforms_json(plan, posed.views, seen, keys | _left_out_views(reasons, records)),
+    )
     return findings
+
+
+def _left_out_views(reasons: Mapping[str, Remark], records: Mapping[str, ViewRecord]) -> dict[str, Any]:
+    """The key of the scene that names views that are not among its frames, and why."""
+    views = [
+        {"name": name, "reason": remark.code.name.lower().replace("_", " ").removeprefix("view "), **paths}
+        for name, remark in reasons.items()
+        for paths in [records[name].paths if name in records else {}]
+    ]
+    return {"left_out": views} if views else {}
 
 
 def _write_points(folder: Path, poses: PoseSet) -> dict[str, str]:
@@ -164,6 +189,7 @@ def _transforms_json(
         "wavelengths": bands.tolist(),
         **_widths(plan, views, bands),
         "value_scale": FULL_SCALE,
+        "calibrated_value_of_1": plan.scale,
         **extra,
         **splits,
         "frames": frames,
@@ -276,6 +302,8 @@ _SHEET_PX, _TILE_PX = 1300, (96, 300)
 """Width of all pictures beside each other; least and greatest longer side of one."""
 _OUTLINE, _IGNORED, _BEHIND = (255, 0, 200), (255, 60, 60), 60
 """Colours of the mask's outline and of pixels without a measurement; grey of the background."""
+_RIM_PX = 4
+"""Width of the frame around a view that is left out."""
 _CHARTS_INCHES, _LEAST_WIDTH_INCHES = 3.6, 11.0
 _LETTERS_AN_INCH = 10
 """Of the heading."""
@@ -283,12 +311,17 @@ _MOST_POINTS = 6000
 
 
 def _contact_sheet(
-    views: Sequence[SeenView], sensors: Mapping[str, Sensor], poses: PoseSet, heading: str
+    views: Sequence[SeenView],
+    sensors: Mapping[str, Sensor],
+    poses: PoseSet,
+    heading: str,
+    left_out: Sequence[ViewRecord] = (),
 ) -> bytes:
-    """The sheet as a PNG, with one group of spectra a sensor and the points in their sRGB."""
+    """The sheet as a PNG, with one group of spectra a sensor and the points in their sRGB; views that are left out
+    stand last, framed in red."""
     from matplotlib.figure import Figure
 
-    tiles = _tiles(views)
+    tiles = _tiles(views, left_out)
     height, width = (length / FIGURE_DPI for length in tiles.shape[:2])
     page_width = max(width + 0.4, _LEAST_WIDTH_INCHES)
     lines = textwrap.wrap(heading, int(page_width * _LETTERS_AN_INCH))
@@ -315,12 +348,18 @@ def _contact_sheet(
     return figure_bytes(figure)
 
 
-def _tiles(views: Sequence[SeenView]) -> UInt8[np.ndarray, "H W 3"]:
+def _tiles(views: Sequence[SeenView], left_out: Sequence[ViewRecord]) -> UInt8[np.ndarray, "H W 3"]:
+    root = views[0].picture.parent.parent
     shown = [views[index] for index in _evenly(len(views), _MOST_VIEWS)]
-    side_px = int(np.clip(_SHEET_PX / columns_for(len(shown)), *_TILE_PX))
-    pictures = [_small_picture(view, side_px) for view in shown]
+    side_px = int(np.clip(_SHEET_PX / columns_for(len(shown) + len(left_out)), *_TILE_PX))
+    files = [(view.picture, view.record) for view in shown]
+    files += [(root / record.paths["file_path"], record) for record in left_out]
+    pictures = [_small_picture(picture, record, side_px) for picture, record in files]
+    for picture in pictures[len(shown) :]:
+        for rim in (picture[:_RIM_PX], picture[-_RIM_PX:], picture[:, :_RIM_PX], picture[:, -_RIM_PX:]):
+            rim[:] = _IGNORED
     size = max(picture.shape[1] for picture in pictures), max(picture.shape[0] for picture in pictures)
-    captions = [view.name for view in shown]
+    captions = [view.name for view in shown] + [f"{record.name} (left out)" for record in left_out]
     layout = CanvasLayout.of(size, captions)
     canvas = Canvas(layout, 3, captions)
     for index, picture in enumerate(pictures):
@@ -333,12 +372,12 @@ def _evenly(count: int, most: int) -> list[int]:
     return np.linspace(0, count - 1, min(count, most)).round().astype(int).tolist()
 
 
-def _small_picture(view: SeenView, side_px: int) -> UInt8[np.ndarray, "h w 3"]:
+def _small_picture(picture_file: Path, record: ViewRecord, side_px: int) -> UInt8[np.ndarray, "h w 3"]:
     """The view on dark grey, with the outline of matter and with pixels that are ignored."""
     from PIL import Image
     from scipy import ndimage
 
-    with Image.open(view.picture) as opened:
+    with Image.open(picture_file) as opened:
         scale = side_px / max(opened.size)
         size = max(1, round(opened.width * scale)), max(1, round(opened.height * scale))
         picture = np.asarray(opened.convert("RGBA").resize(size, Image.Resampling.BOX))
@@ -346,9 +385,9 @@ def _small_picture(view: SeenView, side_px: int) -> UInt8[np.ndarray, "h w 3"]:
     pixels = np.rint(picture[..., :3] * opacity + _BEHIND * (1 - opacity)).astype(np.uint8)
     matter = picture[..., 3] > 127
     pixels[matter & np.logical_not(ndimage.binary_erosion(matter, border_value=1))] = _OUTLINE
-    mask = view.record.paths.get("mask_path")
+    mask = record.paths.get("mask_path")
     if mask is not None:
-        with Image.open(view.picture.parent.parent / mask) as opened:
+        with Image.open(picture_file.parent.parent / mask) as opened:
             ignored = np.asarray(opened.convert("L").resize(size, Image.Resampling.BOX)) < 128
         pixels[ignored] = _IGNORED
     return pixels

@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float32, Float64, UInt8, UInt16
 
 from unmix_plugin.captures.calibration.calibration import CalibratedRows, Calibration, Raster
 from unmix_plugin.captures.spectral_file import CaptureView
+from unmix_plugin.captures.spoilt import sharpness_of
 from unmix_plugin.captures.writing.resampling import Resampling
 from unmix_plugin.engine.runs.atomic_files import whole_file, write_errors_as, write_file
 from unmix_plugin.errors import CaptureError, counted
@@ -106,6 +107,8 @@ class ViewRecord:
     """Median of the same over background, before it is set to black; 0 without any."""
     background_spread: float = 0.0
     """Range from dark to bright background (10th and 90th percentile) over its median."""
+    sharpness: list[float] = field(default_factory=list)
+    """Contrast of fine structures over that of coarse ones, along rows and columns; empty where it is not known."""
     sources: list[dict[str, Any]] = field(default_factory=list)
     """Files it was made of: path, bytes, SHA-256."""
 
@@ -247,6 +250,7 @@ class _Tally:
             mean_spectrum=(self.sum / max(1, self.num_summed)).tolist(),
             background_brightness=usual,
             background_spread=(bright - dark) / usual if usual > 0 else 0.0,
+            sharpness=sharpness_of(self.brightness, seen),
         )
 
 
