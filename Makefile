@@ -1,21 +1,24 @@
 # One virtual environment for everything; each part of it is installed once, and again when its pins change.
 PYTHON ?= python3
 VENV := .venv
+# Empty for the newest versions of all dependencies.
+CONSTRAINTS := constraints.txt
 SCRIPTS := $(if $(filter Windows_NT,$(OS)),Scripts,bin)
 BIN := $(VENV)/$(SCRIPTS)
-INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
+INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check $(if $(CONSTRAINTS),--constraint $(CONSTRAINTS))
 DEMO_SECONDS := 45
 BENCHMARKS := $(filter-out benchmarks/fuzz_guided.py,$(sort $(wildcard benchmarks/[a-z]*.py)))
 
 MINIMUM := .venv-minimum
 MINIMUM_TESTS := tests/engine tests/spectral tests/editing tests/formats tests/scenes tests/figures tests/viewer/test_server.py tests/captures/readers
 
-.PHONY: demo test cases test-all test-minimum test-portable wheel platforms audit lint format bench notebooks site clean help
+.PHONY: demo test cases test-random test-all test-minimum test-portable wheel platforms audit lint format bench notebooks site clean help
 
 help:
 	@echo "make demo    train on the built-in scene, evaluate, export abundance maps and a page to share"
 	@echo "make test    run the tests, less the slow ones"
 	@echo "make cases   run those of the tests that read files as other people's programs write them"
+	@echo "make test-random   run the property tests on cases that are drawn anew"
 	@echo "make test-all   run every test, and check each shape annotation while they run"
 	@echo "make test-minimum   run the core of the tests on the lowest versions that are allowed"
 	@echo "make test-portable   run the tests, less the slow ones, with what only POSIX has taken away"
@@ -57,6 +60,10 @@ test: $(VENV)/.installed-dev $(VENV)/.system-packages
 # A part of `make test`, in less than a minute.
 cases: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest tests/cases
+
+# Elsewhere property tests draw the same cases each time. A failure prints its case: make it a test.
+test-random: $(VENV)/.installed-dev
+	UNMIX_RANDOM_CASES=1 $(BIN)/python -m pytest --numprocesses 2 -m "hypothesis and not slow"
 
 test-all: $(VENV)/.installed-dev $(VENV)/.system-packages
 	$(BIN)/python -m pytest --numprocesses 2 --jaxtyping-packages=unmix_plugin,beartype.beartype

@@ -17,8 +17,10 @@ mpl.use("Agg")
 signal.signal(signal.SIGINT, signal.default_int_handler)
 if hasattr(signal, "SIGHUP"):
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
-settings.register_profile("unmix", deadline=None, derandomize=True)  # a first call may compile a kernel
-settings.load_profile("unmix")
+# A first call may compile a kernel. Cases are the same each time, but in `make test-random`.
+settings.register_profile("unmix", deadline=None, derandomize=True)
+settings.register_profile("random", deadline=None, derandomize=False, max_examples=300, print_blob=True)
+settings.load_profile("random" if os.environ.get("UNMIX_RANDOM_CASES") else "unmix")
 
 
 @pytest.fixture(autouse=True)

@@ -61,6 +61,8 @@ def built(dist: Path) -> Path:
     sdist, wheel = next(dist.glob("*.tar.gz")), next(dist.glob("*.whl"))
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
+        about = next(name for name in names if name.endswith(".dist-info/METADATA"))
+        shown = archive.read(about).decode("utf-8")
     with tarfile.open(sdist) as archive:
         packed = {name.partition("/")[2] for name in archive.getnames()}
     tracked = run("git ls-files", ["git", "-C", str(ROOT), "ls-files", "unmix_plugin"]).split()
@@ -71,6 +73,9 @@ def built(dist: Path) -> Path:
     faults += [f"{sdist.name} holds {name}" for name in packed if name.startswith(KEPT_OUT)]
     faults += [f"{path.name} has {path.stat().st_size:,} bytes, more than {MOST_BYTES:,}"
                for path in files if path.stat().st_size > MOST_BYTES]  # fmt: skip
+    if has_address():
+        faults += [f"{wheel.name}: the link {link} of the README leads nowhere on PyPI"
+                   for link in re.findall(r"\]\((?!https?:|#)([^)]+)\)", shown)]  # fmt: skip
     if faults:
         sys.exit("\n".join(faults))
     print(*(f"{path.name}: {path.stat().st_size / 1e6:.2f} MB" for path in files), sep="\n")
@@ -155,6 +160,11 @@ def run(what: str, command: list[str], place: Path = ROOT, variables: dict[str, 
     return ended.stdout
 
 
+def has_address() -> bool:
+    """Whether the package states the address of its repository."""
+    return re.search(r"^Repository = ", (ROOT / "pyproject.toml").read_text("utf-8"), re.M) is not None
+
+
 def require_releasable() -> None:
     """Refuse to publish what is not ready."""
     version = re.findall(
@@ -170,13 +180,10 @@ def require_releasable() -> None:
         re.M,
     ):
         faults.append(f"CHANGELOG.md has no heading '## [{version}] - YYYY-MM-DD'")
-    pages = [path for path in (ROOT / "README.md", *ROOT.glob("docs/**/*.md"), ROOT / "CONTRIBUTING.md")
-             if "<URL of this repository>" in path.read_text("utf-8")]  # fmt: skip
-    faults += [
-        f"{path.relative_to(ROOT)}: put the address in place of <URL of this repository>" for path in pages
-    ]
-    if not re.search(r"^Repository = ", (ROOT / "pyproject.toml").read_text("utf-8"), re.M):
-        faults.append("pyproject.toml: add Repository to [project.urls]")
+    if not has_address():
+        faults.append(
+            "pyproject.toml: add Repository to [project.urls]: links and pictures of the README lead there on PyPI"
+        )
     if faults:
         sys.exit("\n".join(faults))
 

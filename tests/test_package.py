@@ -1,6 +1,8 @@
 """What is true of the distribution as a whole: what a wheel holds, and what an import costs."""
 
 import configparser
+import json
+import re
 import subprocess
 import sys
 import zipfile
@@ -18,6 +20,8 @@ HEAVY = (
     *("colour", "scipy", "skimage", "matplotlib", "warp", "OpenEXR", "viser", "pandas", "tensorboard"),
     *("h5py", "tifffile", "PIL", "pycolmap", "cv2"),
 )
+ADDRESS = "https://example.org/unmix-nerf"
+"""Where the repository would be."""
 COMMANDS = ("train", "eval", "render", "demo_scene", "demo", "process", "view", "export")
 
 
@@ -27,8 +31,12 @@ def wheel(tmp_path_factory):
     folder = tmp_path_factory.mktemp("wheel")
     source = folder / "source"
     source.mkdir()
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
+    for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE"):
         (source / name).write_bytes((ROOT / name).read_bytes())
+    project = (source / "pyproject.toml").read_text(encoding="utf-8")
+    if "\nRepository = " not in project:
+        project = project.replace("[project.urls]\n", f'[project.urls]\nRepository = "{ADDRESS}"\n')
+    (source / "pyproject.toml").write_text(project, encoding="utf-8")
     copytree(ROOT / "unmix_plugin", source / "unmix_plugin", ignore=ignore_patterns("__pycache__"))
     options = ["--quiet", "--no-deps", "--no-build-isolation", "--disable-pip-version-check"]
     command = [sys.executable, "-m", "pip", "wheel", *options, "--wheel-dir", str(folder), str(source)]
@@ -62,14 +70,49 @@ def test_a_wheel_declares_commands_and_methods(wheel):
 @pytest.mark.slow
 def test_a_wheel_carries_licence_readme_and_dependency_ranges(wheel):
     metadata = Parser().parsestr(metadata_file(wheel, "METADATA"))
-    assert metadata["License-Expression"] == "Apache-2.0"
+    assert metadata["License-Expression"] == "Apache-2.0 AND MIT"  # MIT: three.js
     assert metadata["Requires-Python"] == ">=3.10"  # so that pip refuses older ones in one message
     assert metadata["Version"] == __import__("unmix_plugin").__version__
-    assert str(metadata.get_payload()).strip()
     needed = [line for line in metadata.get_all("Requires-Dist", []) if "extra ==" not in line]
     assert any(line.startswith("torch") for line in needed)
     assert not [line for line in needed if "==" in line]  # a library bounds its dependencies, but pins none
     assert "Apache License" in metadata_file(wheel, "licenses/LICENSE")
+
+
+@pytest.mark.slow
+def test_links_and_pictures_of_the_readme_work_away_from_the_repository(wheel):
+    metadata = Parser().parsestr(metadata_file(wheel, "METADATA"))
+    assert metadata["Description-Content-Type"] == "text/markdown"
+    links = re.findall(r"\]\(([^)]+)\)", str(metadata.get_payload()))
+    assert len(links) > 15
+    assert [link for link in links if not link.startswith(("https://", "#"))] == []
+
+
+def test_licences_of_code_that_is_shipped_are_named():
+    """Of the bundle of three.js, which carries its own."""
+    bundle = (ROOT / "unmix_plugin/products/page/three.js").read_text(encoding="utf-8")
+    assert "The MIT License" in bundle
+    assert '\nlicense = "Apache-2.0 AND MIT"' in (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+
+
+def commands_in(record):
+    """All commands that a record of training and the records within it name."""
+    nested = [
+        command for value in record.values() if isinstance(value, dict) for command in commands_in(value)
+    ]
+    return [*nested, *([record["command"]] if "command" in record else [])]
+
+
+@pytest.mark.parametrize(
+    "path", sorted((ROOT / "unmix_plugin/neumatex/weights").glob("*.json")), ids=lambda path: path.name
+)
+def test_records_of_shipped_weights_name_modules_that_are_here(path):
+    commands = commands_in(json.loads(path.read_text(encoding="utf-8")))
+    assert commands
+    for command in commands:
+        python, option, module = command.split()[:3]
+        assert (python, option) == ("python", "-m")
+        assert (ROOT / f"{module.replace('.', '/')}.py").is_file()
 
 
 def lines_printed_by(code):

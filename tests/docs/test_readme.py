@@ -1,4 +1,5 @@
-"""README.md: every command on it runs as it stands, on a tiny scene; its links lead somewhere."""
+"""README.md and docs/reference/commands.md: every command on them runs as it stands, on a tiny scene; links lead
+somewhere; the README is short."""
 
 import re
 import shlex
@@ -11,7 +12,8 @@ from tests.docs.pages import ROOT, blocks_of, text_of
 from tests.test_public_surface import COMMANDS
 from unmix_plugin.products.page import page as page_module
 
-README = text_of("README.md")
+README, COMMANDS_PAGE = "README.md", "docs/reference/commands.md"
+MOST_WORDS = 900
 PAGES = [
     "README.md",
     "CHANGELOG.md",
@@ -36,8 +38,10 @@ SMALLER = {
 
 def commands():
     """Command lines of the blocks and of the table's examples in order; no viewer, which never ends."""
-    lines = [line for code in blocks_of("README.md", "") for line in code.splitlines()]
-    lines += re.findall(r"^\|.*\| `(unmix-[^`]*)` \|$", README, re.MULTILINE)
+    lines = [
+        line for page in (README, COMMANDS_PAGE) for code in blocks_of(page, "") for line in code.splitlines()
+    ]
+    lines += re.findall(r"^\|.*\| `(unmix-[^`]*)` \|$", text_of(COMMANDS_PAGE), re.MULTILINE)
     return [line for line in lines if line.startswith("unmix-") and not line.startswith("unmix-view")]
 
 
@@ -47,7 +51,7 @@ def place(tmp_path_factory):
     folder = tmp_path_factory.mktemp("readme")
     (folder / "paint.csv").write_text("wavelength,paint\n300,0.2\n1100,0.6\n")
     (folder / "responses.csv").write_text("wavelength,R,G\n500,0,1\n600,1,0\n700,0,0\n")
-    (recipe,) = blocks_of("README.md", "yaml")
+    (recipe,) = blocks_of(COMMANDS_PAGE, "yaml")
     (folder / "edits.yml").write_text(recipe)
     return folder
 
@@ -71,6 +75,11 @@ def test_every_command_runs(place, monkeypatch):
             run_of(ended).rename("outputs/my-scene/unmix-nerf/2026-01-31_120000")
         ran.add(command)
     assert ran == set(COMMANDS) - {"unmix-view"}
+
+
+def test_the_readme_is_short_and_says_first_what_its_pictures_show():
+    assert len(text_of(README).split()) <= MOST_WORDS
+    assert "rendered scenes" in text_of(README).partition("\n```")[0]
 
 
 @pytest.mark.parametrize("page", PAGES)

@@ -21,6 +21,7 @@ from tests.products.ball_model import (
     seen_surface,
 )
 from tests.products.mesh_reading import loaded_mesh
+from tests.systems import needs_xatlas
 from tests.trained.camera_scenes import FRAME
 from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.products.mesh import _mesh_paths, _textures, _write_mesh, export
@@ -235,6 +236,7 @@ def sampled(picture, uv):
     return pixels[rows.clip(0, len(pixels) - 1), columns.clip(0, pixels.shape[1] - 1)]
 
 
+@needs_xatlas
 @pytest.mark.parametrize("kind", ["obj", "glb"])
 def test_textures_show_the_material_of_the_place_that_they_lie_on(textured, files, kind):
     mesh = loaded_mesh(textured / f"mesh.{kind}")
@@ -253,6 +255,7 @@ def test_textures_show_the_material_of_the_place_that_they_lie_on(textured, file
     assert (mesh.vertex_normals * outwards).sum(axis=1).min() > 0
 
 
+@needs_xatlas
 def test_a_textured_glb_has_its_segmentation_and_abundances_as_variants(textured):
     data = (textured / "mesh.glb").read_bytes()
     content = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
@@ -267,6 +270,7 @@ def test_a_textured_glb_has_its_segmentation_and_abundances_as_variants(textured
     assert "map_Kd mesh_colour.png" in (textured / "mesh.mtl").read_text()
 
 
+@needs_xatlas
 def test_what_shows_nothing_from_above_has_no_material(tmp_path):
     corners = np.array(
         [[0.9, 0.0, 0.0], [0.9, 0.0, 0.1], [0.9, 0.1, 0.0]]
@@ -294,6 +298,7 @@ def test_impossible_settings_are_refused(asked, said):
         export(MagicMock(spec=Job), asked)
 
 
+@needs_xatlas
 def test_surfaces_that_are_none_and_textures_that_are_too_small_or_of_no_size_are_refused(densities, outside):
     for size, said in ((9, "--texture-size is 9; choose 16 to 8192"), (16, "choose a larger --texture-size")):
         with pytest.raises(ConfigError, match=said):

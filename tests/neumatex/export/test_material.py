@@ -10,6 +10,7 @@ from PIL import Image
 
 from tests.neumatex.surfaces import LAYERED, PBR, TURN, ball, eye_directions, generator, knot
 from tests.products.mesh_reading import loaded_mesh
+from tests.systems import needs_xatlas
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.neumatex.export import pbr_fit
 from unmix_plugin.neumatex.export.material import material_paths, write_material
@@ -53,6 +54,7 @@ def png(path):
     return np.asarray(Image.open(path), dtype=np.float32) / 255
 
 
+@needs_xatlas
 def test_the_gltf_shows_the_material_where_the_surface_has_it(written):
     loaded = loaded_mesh(written / "material.glb")
     model = FRAME.to_model(np.asarray(loaded.vertices, dtype=np.float64))
@@ -67,6 +69,7 @@ def test_the_gltf_shows_the_material_where_the_surface_has_it(written):
     assert (pbr.metallicFactor, pbr.roughnessFactor) == (1, 1)
 
 
+@needs_xatlas
 def test_the_gltf_is_the_mesh_in_the_world_in_metres_where_the_scale_is_known(written, tmp_path):
     loaded, mesh = loaded_mesh(written / "material.glb"), knot()
     assert len(loaded.faces) == len(mesh.faces)
@@ -81,6 +84,7 @@ def test_the_gltf_is_the_mesh_in_the_world_in_metres_where_the_scale_is_known(wr
     np.testing.assert_allclose(metres, 0.001 * np.asarray(loaded.vertices), atol=1e-7)
 
 
+@needs_xatlas
 def test_far_from_the_origin_the_gltf_keeps_positions_to_a_millionth_in_units_of_any_size(tmp_path):
     mesh, frame = knot(), Normalisation(np.eye(3), np.array([3.37, 5.21, 0.0]), 1000.0)  # of 2 mm, in metres
     write_material(tmp_path, mesh, PBR, frame, 256)
@@ -89,6 +93,7 @@ def test_far_from_the_origin_the_gltf_keeps_positions_to_a_millionth_in_units_of
     assert np.abs(found - world[mesh.faces.numpy()]).max() < 1e-6 * np.ptp(world, axis=0).max()
 
 
+@needs_xatlas
 def test_pictures_are_srgb_numbers_linear_and_both_are_what_the_report_says(written):
     numbers, picture = exr(written / "base_colour.exr"), png(written / "base_colour.png")
     assert numbers.shape == picture.shape == (256, 256, 3)
@@ -141,6 +146,7 @@ def test_a_layered_material_that_is_a_gltf_one_is_found_again(monkeypatch):
     assert (errors < torch.tensor([0.06] * 4 + [0.1])).all()
 
 
+@needs_xatlas
 def test_impossible_sizes_and_what_is_missing_are_refused(monkeypatch):
     for size in (0, 15, 8193):
         with pytest.raises(ConfigError, match=f"--texture-size is {size}; choose 16 to 8192"):
@@ -160,6 +166,7 @@ def flat_texels(size, uv, faces):
     return texels_of(Atlas(np.arange(len(uv)), np.array(faces), np.array(uv, dtype=np.float32)), size)
 
 
+@needs_xatlas
 def test_charts_keep_every_triangle_lie_in_the_unit_square_and_share_no_texel(monkeypatch):
     mesh = ball()
     atlas = unwrapped(mesh, 256)
@@ -179,6 +186,7 @@ def test_charts_keep_every_triangle_lie_in_the_unit_square_and_share_no_texel(mo
     np.testing.assert_array_equal(parts.triangles, texels.triangles)
 
 
+@needs_xatlas
 def test_texels_show_the_points_of_the_surface_that_their_centres_map_to():
     mesh, size = ball(3), 128
     atlas = unwrapped(mesh, size)
@@ -204,6 +212,7 @@ def test_a_texture_has_the_values_of_its_texels_and_beyond_them_those_of_the_nea
     np.testing.assert_array_equal(picture[..., 0], np.repeat(np.arange(8.0)[:, None], 8, axis=1))
 
 
+@needs_xatlas
 def test_tiny_triangles_are_placed_too():
     mesh = ball(4)
     atlas = unwrap(1e-5 * mesh.vertices.double().numpy(), mesh.faces.numpy(), 512)

@@ -16,6 +16,7 @@ from tests.neumatex import factory
 from tests.neumatex.factory import SMALL, trained_on, write_light, write_object, write_spectral_object
 from tests.neumatex.surfaces import generator, unit
 from tests.products import ball_model
+from tests.systems import needs_xatlas
 from unmix_plugin.commands.eval import evaluate
 from unmix_plugin.commands.export import export
 from unmix_plugin.commands.render import render
@@ -171,6 +172,7 @@ def test_a_fit_begins_at_the_prior_which_stays_as_it_is(tmp_path, material, fit_
     assert all(name.startswith("triplane.") for name in moved)
 
 
+@needs_xatlas
 def test_the_material_is_exported_with_its_decoder_and_mixtures_are_not(neural, tmp_path, monkeypatch):
     monkeypatch.setattr(pbr_fit, "_STEPS", 5)
     place = ["--run", neural, "--output", tmp_path, "--device", "cpu"]
@@ -247,6 +249,7 @@ def test_another_light_in_colours_gets_the_lamps_spectrum(scene):
     assert torch.equal(back.environment.image, scene.environment.image)
 
 
+@needs_xatlas
 def test_the_export_has_abundance_textures_and_endmembers(spectral):
     done(export, "material", "--run", spectral, "--device", "cpu", "--texture-size", 64)
     folder = spectral / "exports" / "material"

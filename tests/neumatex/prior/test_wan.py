@@ -6,8 +6,6 @@ from typing import Any
 
 import pytest
 import torch
-from diffusers.models.autoencoders.autoencoder_kl_wan import AutoencoderKLWan
-from diffusers.models.transformers.transformer_wan import WanTransformer3DModel
 from safetensors.torch import load_file, save_file
 from torch.testing import assert_close
 
@@ -15,6 +13,10 @@ from tests.neumatex.surfaces import generator
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.neumatex.prior.wan import WanPrior, read_wan_prior
 from unmix_plugin.neumatex.tracing.surface import Triplane
+
+pytest.importorskip("diffusers", reason="needs the extra lmrm")
+from diffusers.models.autoencoders.autoencoder_kl_wan import AutoencoderKLWan
+from diffusers.models.transformers.transformer_wan import WanTransformer3DModel
 
 WAN_1_3B: dict[str, Any] = {
     "num_layers": 30, "num_attention_heads": 12, "attention_head_dim": 128, "ffn_dim": 8960, "patch_size": (1, 2, 2),
