@@ -1,5 +1,8 @@
 import hashlib
 import json
+import os
+import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -173,6 +176,24 @@ def test_a_file_of_another_machine_is_not_looked_for_by_its_bare_name_where_more
     assert find_named(tmp_path, "/home/someone/masks/a.png", least_parts=2) is None
     (tmp_path / "inside").mkdir()
     assert find_named(tmp_path / "inside", "../a.png") is None
+
+
+def test_names_in_another_case_are_found_in_a_folder_of_thousands_and_after_it_changed(tmp_path, monkeypatch):
+    (tmp_path / "Images").mkdir()
+    for index in range(300):
+        (tmp_path / "Images" / f"F_{index:04d}.PNG").touch()
+    long_ago = time.time() - 60
+    os.utime(tmp_path / "Images", (long_ago, long_ago))
+    listed = []
+    listing = Path.iterdir
+    monkeypatch.setattr(Path, "iterdir", lambda folder: listed.append(folder) or listing(folder))
+    for index in range(300):
+        expected = tmp_path / "Images" / f"F_{index:04d}.PNG"
+        assert find_named(tmp_path, f"Images/f_{index:04d}.png") == expected
+    assert len(listed) == 1
+    assert find_named(tmp_path, "Images/f_new.png") is None
+    (tmp_path / "Images" / "F_NEW.png").touch()
+    assert find_named(tmp_path, "Images/f_new.png") == tmp_path / "Images" / "F_NEW.png"
 
 
 def test_black_pixels_of_a_mask_do_not_count_and_opaque_pictures_are_no_alpha(tmp_path):

@@ -9,9 +9,11 @@ import hashlib
 import json
 import math
 import re
+import time
 import unicodedata
 from collections.abc import Mapping
 from contextlib import suppress
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -171,13 +173,31 @@ def _in_any_case(root: Path, parts: list[str]) -> Path | None:
     path = root
     for part in parts:
         if not (path / part).exists() and part != "..":
-            entries = path.iterdir() if path.is_dir() else ()
-            alike = [entry.name for entry in entries if _plain(entry.name) == _plain(part)]
+            if not path.is_dir():
+                return None
+            changed = path.stat().st_mtime_ns
+            # A folder may change twice within one tick of its clock: what was just written is listed anew.
+            is_settled = time.time_ns() - changed > _SETTLED_NS
+            listed = _listed(path, changed) if is_settled else _listed.__wrapped__(path, changed)
+            alike = listed.get(_plain(part), [])
             if len(alike) != 1:
                 return None
             part = alike[0]
         path = path / part
     return path
+
+
+_SETTLED_NS = 2_000_000_000
+"""After its last change, from when on a folder's listing is kept."""
+
+
+@lru_cache(maxsize=32)
+def _listed(folder: Path, _: int) -> dict[str, list[str]]:
+    """Names in a folder by what they are in any case; one listing serves thousands of frames."""
+    listed: dict[str, list[str]] = {}
+    for entry in folder.iterdir():
+        listed.setdefault(_plain(entry.name), []).append(entry.name)
+    return listed
 
 
 def _plain(name: str) -> str:

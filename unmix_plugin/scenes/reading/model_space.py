@@ -129,6 +129,8 @@ class _JudgedBackdrop:
     box: SceneBox | None = None
     """Of what stands before it."""
     decision: Decision | None = None
+    is_refuted: bool = False
+    """Whether there is what looks like one and is none."""
 
 
 _NO_BACKDROP = _JudgedBackdrop()
@@ -155,7 +157,7 @@ def _judge_backdrop(views: Views) -> _JudgedBackdrop:
     evidence = {"looks": before.in_words, "contradicted": contradicted}
     decision = Decision("backdrop", "none" if is_refuted else "found", evidence, tried, "--world")
     if is_refuted:
-        return _JudgedBackdrop(decision=decision)
+        return _JudgedBackdrop(decision=decision, is_refuted=True)
     return _JudgedBackdrop(before, box, decision=decision)
 
 
@@ -200,7 +202,7 @@ def find_model_space(
     is_unbounded, reason = options.world == "unbounded", None
     decisions = [] if backdrop.decision is None else [backdrop.decision]
     if options.world == "auto" and not has_masks and not (points and points.are_equally_far):
-        evidence = find_world_evidence(box, compared)
+        evidence = replace(find_world_evidence(box, compared), has_plain_sides=backdrop.is_refuted)
         if not evidence.goes_on:
             places = points or find_matched_points(compared)
             evidence = evidence if places is None else evidence.with_places(box, places.places)
