@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import stat
 import zipfile
 from pathlib import Path
@@ -110,6 +111,25 @@ def allow_decoded(path: Path, decoded: int, kind: type[UnmixError], stored: int 
             f"{size:,} bytes decode to {decoded:,}",
             f"at most {_FREE_BYTES:,}, or {_MOST_RATIO} times what is stored",
             kind,
+        )
+
+
+_LEFT_FREE_BYTES = 1 << 28
+"""Of a disk, beside what is decoded on it."""
+
+
+def has_scratch_room(folder: Path, needed: int) -> bool:
+    """Whether so many bytes can be decoded on the disk of a folder."""
+    return shutil.disk_usage(folder).free >= needed + _LEFT_FREE_BYTES
+
+
+def allow_scratch(path: Path, needed: int, folder: Path, kind: type[UnmixError]) -> None:
+    """Ask before a file is decoded on the disk of a folder. Raises UnmixError: of this kind: the disk has no room."""
+    if not has_scratch_room(folder, needed):
+        free = shutil.disk_usage(folder).free
+        raise kind(
+            f"{path}: {needed:,} bytes are needed to decode it in {folder}, of which {free:,} are free; name a larger "
+            "disk in TMPDIR, or write the file uncompressed"
         )
 
 

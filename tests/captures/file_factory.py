@@ -15,6 +15,7 @@ import torch
 from PIL import Image
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
+from unmix_plugin.captures.numbers import Held, Numbers
 from unmix_plugin.captures.spectral_file import BandTable, SpectralFile
 
 
@@ -27,8 +28,8 @@ def file_of(values: np.ndarray, wavelengths_nm: np.ndarray | None = None, **fact
         "npy",
         (height, width, bands),
         values.dtype,
-        lambda rows, wanted: values[rows][..., wanted],
-        table,
+        bands=table,
+        numbers=Numbers((Held(values),), (height, width, bands), "yxb", values.dtype),
         **facts,
     )
 

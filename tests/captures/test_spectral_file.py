@@ -7,6 +7,7 @@ import pytest
 
 from tests.captures.file_factory import file_of, present
 from unmix_plugin.captures.calibration.exposures import exposure_of
+from unmix_plugin.captures.numbers import Held, Numbers
 from unmix_plugin.captures.readers.band_files import stack_bands
 from unmix_plugin.captures.spectral_file import BandTable, SpectralFile, linear_values
 from unmix_plugin.errors import CaptureError
@@ -83,11 +84,13 @@ NO_LUCK = r"a: can't be read \(RuntimeError: no luck at all\)"
     [(RuntimeError("no luck\nat all"), NO_LUCK), (MemoryError(), "a: too little memory")],
 )
 def test_what_a_library_raises_while_reading_is_an_error_of_the_file(tmp_path, error, message):
-    def read_part(*_):
-        raise error
+    class Failing(Held):
+        def array(self):
+            raise error
 
+    stored = Numbers((Failing(np.zeros(1)),), (2, 3, 1), "yxb", np.dtype("u1"))
     with pytest.raises(CaptureError, match=message):
-        SpectralFile(tmp_path / "a", "npy", (2, 3, 1), np.dtype("u1"), read_part).read()
+        SpectralFile(tmp_path / "a", "npy", (2, 3, 1), np.dtype("u1"), stored).read()
 
 
 def test_bands_that_are_not_there_are_an_index_error():

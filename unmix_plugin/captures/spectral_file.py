@@ -1,37 +1,26 @@
 """A file of an instrument, opened but not read: what it says of itself, and its numbers by rows and bands; and the
 views of a capture, which are made of such files.
 
-Notation: `H` rows, `W` columns, `B` bands. Axes of stored arrays are letters, the slowest first: `y` rows, `x`
-columns, `b` bands.
+Notation: `H` rows, `W` columns, `B` bands.
 """
 
 from __future__ import annotations
 
-import threading
-from collections import OrderedDict
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int, Shaped
+from jaxtyping import Bool, Float32, Float64, Shaped
 
 from unmix_plugin.captures.names import natural_order
+from unmix_plugin.captures.numbers import Axes, BandIndex, Numbers, find_zeros
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.pose_set import PoseSet
 from unmix_plugin.errors import CaptureError, install_hint
-
-Axes: TypeAlias = Literal["yxb", "byx", "ybx", "xyb", "bxy", "xby"]
-"""What the axes of an array are, the slowest first: y rows, x columns, b bands."""
-BandIndex: TypeAlias = slice | Int[np.ndarray, " b"]
-"""Some bands: a slice, or their indices in any order."""
-_ReadPart: TypeAlias = Callable[[slice, BandIndex], Shaped[np.ndarray, "h W b"]]
-"""Stored numbers of some rows, and of bands in rising order; slices have both ends and no step."""
-_MissingPart: TypeAlias = Callable[[slice, BandIndex], Bool[np.ndarray, "h W"]]
-"""Pixels of some rows without a measurement in one of some bands."""
 
 COLOURS_AS_STORED = (
     "red, green and blue are taken as light, as stored; if they are a picture's for people (sRGB), save it as PNG of "
@@ -44,9 +33,6 @@ GIVEN = "given by the user"
 """Evidence of wavelengths that files do not state, or state wrongly."""
 _MEASURES_NOTHING = 1e30
 _FLOAT32_EPS = float(np.finfo(np.float32).eps)
-_KEPT_BYTES = 2**28
-_kept: OrderedDict[tuple[Hashable, ...], np.ndarray] = OrderedDict()
-_lock = threading.Lock()
 
 
 @dataclass(frozen=True)
@@ -155,8 +141,10 @@ class SpectralFile:
     """H, W, B."""
     dtype: np.dtype
     """Type of the stored numbers, in any byte order."""
-    read_part: _ReadPart = field(repr=False)
-    """How `read` gets its numbers."""
+    numbers: Numbers | None = field(default=None, repr=False)
+    """Where the numbers lie, rows before and behind the image among them; None where they are those of `parts`."""
+    parts: tuple[SpectralFile, ...] = field(default=(), repr=False)
+    """Files that hold one band each, of which each says itself what is missing in it."""
     bands: BandTable = BandTable()
     interleave: str | None = None
     """bsq, bil or bip where the format has a choice."""
@@ -174,10 +162,12 @@ class SpectralFile:
     """Other facts by name, as JSON-able values: exposure_s, gain, f_number, black_level, xmp, ..."""
     sources: tuple[Path, ...] = ()
     """Files that hold the numbers, where they are not `path` alone."""
+    first_line: int = 0
+    """Of the numbers, the line that is the first of the image."""
     dark_lines: int = 0
     """Lines after the image that were taken with the shutter closed."""
-    missing_part: _MissingPart | None = field(default=None, repr=False)
-    """Which pixels hold no measurement beyond what `no_data` and `valid_range` say of all bands."""
+    masks: tuple[Numbers, ...] = field(default=(), repr=False)
+    """Of one band or as many as the file, 0 where a pixel holds no measurement."""
 
     def read(self, rows: slice = slice(None), bands: BandIndex = slice(None)) -> Shaped[np.ndarray, "h W b"]:
         """Stored numbers of some rows and bands, in the machine's byte order.
@@ -198,9 +188,8 @@ class SpectralFile:
             return np.zeros((wanted[0], width, len(indices)), self.dtype.newbyteorder("="))
         is_slice = len(rising) == len(indices) == rising[-1] - rising[0] + 1
         try:
-            values = self.read_part(
-                slice(first, last), slice(rising[0], rising[-1] + 1) if is_slice else rising
-            )
+            chosen = slice(rising[0], rising[-1] + 1) if is_slice else rising
+            values = self._read(slice(first, last), chosen)
         except CaptureError:
             raise
         except Exception as error:
@@ -210,19 +199,19 @@ class SpectralFile:
         values = values if np.array_equal(rising, indices) else values[..., order]
         return np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("="))
 
+    def _read(self, rows: slice, bands: BandIndex) -> Shaped[np.ndarray, "h W b"]:
+        if self.numbers is not None:
+            return self.numbers.read(slice(self.first_line + rows.start, self.first_line + rows.stop), bands)
+        parts = [self.parts[band] for band in np.arange(len(self.parts))[bands]]
+        return np.concatenate([part.read(rows) for part in parts], axis=-1)
+
     @property
     def dark(self) -> SpectralFile | None:
         """The lines that were taken with the shutter closed, as a dark frame; None where there are none."""
         if not self.dark_lines:
             return None
-        begin = self.shape[0]
-        return replace(
-            self,
-            shape=(self.dark_lines, *self.shape[1:]),
-            read_part=lambda rows, bands: self.read_part(slice(begin + rows.start, begin + rows.stop), bands),
-            dark_lines=0,
-            missing_part=None,
-        )
+        shape = (self.dark_lines, *self.shape[1:])
+        return replace(self, shape=shape, first_line=self.shape[0], dark_lines=0, masks=())
 
     @property
     def files(self) -> tuple[Path, ...]:
@@ -250,30 +239,21 @@ def find_missing(
     for no_data in filter(np.isfinite, file.no_data):
         same = _is_number(stored, no_data)
         missing |= same.all(axis=-1) if no_data == 0 else same.any(axis=-1)
-    if file.missing_part is not None:
-        missing |= file.missing_part(slice(*rows.indices(file.shape[0])), bands)
+    asked = slice(*rows.indices(file.shape[0])[:2])
+    if file.masks:
+        missing |= find_zeros(file.masks, asked, bands)
+    for index, band in enumerate(np.arange(len(file.parts))[bands] if file.parts else ()):
+        missing |= find_missing(stored[..., index : index + 1], file.parts[band], asked)
     return missing
 
 
-def with_mask(
-    file: SpectralFile, name: str, read_mask: Callable[[slice, BandIndex], Shaped[np.ndarray, "h W b"]]
-) -> SpectralFile:
-    """The file with pixels missing where a mask is 0 in one of the bands that are asked for.
+def with_mask(file: SpectralFile, name: str, mask: Numbers) -> SpectralFile:
+    """The file with pixels missing where a mask, called `name` in notes, is 0 in one of the bands that are asked for.
 
     Source: GDAL, RFC 15: band masks: 0 is no data.
-
-    Args:
-        name: What the mask is called in notes.
-        read_mask: Its numbers at some rows of the file, for some of its bands or one for all.
     """
-    before = file.missing_part
-
-    def missing_part(rows: slice, bands: BandIndex) -> np.ndarray:
-        missing = (read_mask(rows, bands) == 0).any(axis=-1)
-        return missing if before is None else missing | before(rows, bands)
-
     note = f"pixels where {name} is 0 count as not measured"
-    return replace(file, missing_part=missing_part, notes=(*file.notes, note))
+    return replace(file, masks=(*file.masks, mask), notes=(*file.notes, note))
 
 
 def _is_number(stored: np.ndarray, number: float) -> Bool[np.ndarray, "*shape"]:
@@ -299,31 +279,6 @@ def unreadable(path: Path, error: Exception) -> CaptureError:
         return CaptureError(f"{path}: too little memory to read it; cut the file in parts")
     reason = " ".join(str(error).split())[:300] or "no reason given"
     return CaptureError(f"{path}: can't be read ({type(error).__name__}: {reason}); copy the file again")
-
-
-def take_part(stored: np.ndarray, axes: str, rows: slice, bands: BandIndex) -> np.ndarray:
-    """A copy (h, W, b) of some rows and bands of a stored array."""
-    return np.array(stored.transpose([axes.index(axis) for axis in "yxb"])[rows][:, :, bands], order="C")
-
-
-def loaded(load: Callable[..., np.ndarray], path: Path, *arguments: Hashable) -> np.ndarray:
-    """The array that `load(path, *arguments)` gives; read again only if others came between or the file changed.
-
-    Arrays of 256 MiB together are kept, or one that is larger.
-    """
-    state = path.stat()
-    key = (load, path.resolve(), arguments, state.st_size, state.st_mtime_ns)
-    with _lock:
-        if key in _kept:
-            _kept.move_to_end(key)
-            return _kept[key]
-    array: Any = load(path, *arguments)
-    array.setflags(write=False)
-    with _lock:
-        _kept[key] = array
-        while len(_kept) > 1 and sum(kept.nbytes for kept in _kept.values()) > _KEPT_BYTES:
-            _kept.popitem(last=False)
-    return array
 
 
 def import_extra(package: str) -> ModuleType:

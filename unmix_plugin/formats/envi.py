@@ -16,7 +16,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -31,7 +31,7 @@ HeaderValue: TypeAlias = str | int | Sequence[str] | Sequence[float] | np.ndarra
 
 _TYPES = {1: "u1", 2: "i2", 3: "i4", 4: "f4", 5: "f8", 12: "u2", 13: "u4", 14: "i8", 15: "u8"}
 _FLOAT32, UINT16 = 4, 12
-_AXES = {"bsq": "byx", "bil": "ybx", "bip": "yxb"}
+_AXES: dict[str, Literal["byx", "ybx", "yxb"]] = {"bsq": "byx", "bil": "ybx", "bip": "yxb"}
 _LARGEST = 2**40
 _SAID_ONCE = re.compile(
     r"samples|lines|bands|header offset|data type|interleave|byte order|wavelength.*|fwhm|bbl|data .*|reflectance.*"
@@ -74,7 +74,7 @@ class EnviLayout:
         return self.offset + math.prod(self.shape) * self.dtype.itemsize
 
     @property
-    def axes(self) -> str:
+    def axes(self) -> Literal["byx", "ybx", "yxb"]:
         """Order of the axes on disk, the slowest first: y lines, x samples, b bands."""
         return _AXES[self.interleave]
 

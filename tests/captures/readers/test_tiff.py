@@ -17,6 +17,7 @@ from tests.captures.file_factory import (
     rows_and_bands_of,
     xmp_packet,
 )
+from unmix_plugin.captures import numbers
 from unmix_plugin.captures.calibration.references import find_missing
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import ReadOptions, SpectralFile
@@ -215,7 +216,8 @@ def test_previews_and_pages_of_other_sizes_are_left_out(tmp_path, below):
     check_file(open_spectral_file(tmp_path / "a.tif"), values=CUBE, warning="left out: 1 of 35 x 25 x 3")
 
 
-def test_the_first_rows_of_a_compressed_file_are_read_without_the_rest(tmp_path):
+def test_a_damaged_strip_is_an_error_of_the_rows_that_it_has(tmp_path, monkeypatch):
+    monkeypatch.setattr(numbers, "_PIECE_BYTES", 1)
     file, path = written(tmp_path, CUBE, **STORAGE["deflated strips"]), tmp_path / "a.tif"
     data = bytearray(path.read_bytes())
     with tifffile.TiffFile(path) as opened:
@@ -296,7 +298,7 @@ def test_pixels_of_0_in_a_mask_beside_the_file_are_missing(tmp_path, bands):
     found = find_missing(file.read(rows, wanted), file, rows, wanted)
     np.testing.assert_array_equal(found, expected.any(axis=-1))
     tifffile.imwrite(tmp_path / "a.tif.msk", mask[1:, :, 0], photometric="minisblack")
-    check_file(written(tmp_path, CUBE), warning="the mask a.tif.msk has 69 x 50", missing_part=None)
+    check_file(written(tmp_path, CUBE), warning="the mask a.tif.msk has 69 x 50", masks=())
 
 
 def test_a_plain_page_that_is_left_out_in_the_file_is_missing(tmp_path):

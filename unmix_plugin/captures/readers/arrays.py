@@ -6,12 +6,12 @@ Notation: `H` rows, `W` columns, `B` bands.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from math import prod
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
@@ -29,21 +29,16 @@ from unmix_plugin.captures.header_values import (
     state_linear,
 )
 from unmix_plugin.captures.names import common_length
+from unmix_plugin.captures.numbers import Axes, Block, Numbers
 from unmix_plugin.captures.spectral_file import (
-    Axes,
-    BandIndex,
     BandTable,
     Linear,
     ReadOptions,
     SpectralFile,
     linear_values,
-    take_part,
 )
 from unmix_plugin.errors import CaptureError, name_some
 from unmix_plugin.limits import MOST_BANDS, MOST_TEXT_BYTES, allow_parts
-
-_TakePart: TypeAlias = Callable[[Axes, slice, BandIndex], np.ndarray]
-"""(h, W, b) numbers of a stored array whose axes are these."""
 
 _SIDES = ("nrow", "nrows", "ncol", "ncols")
 _NO_DATA = (
@@ -87,10 +82,8 @@ class FoundArray:
     """With the groups that it is in, separated by `/`."""
     shape: tuple[int, ...]
     dtype: np.dtype
-    whole: Callable[[], np.ndarray]
-    """All its numbers, mapped or loaded, perhaps of a smaller type."""
-    take: _TakePart | None = None
-    """A faster way to some rows and bands than through `whole`."""
+    numbers: Block
+    """Perhaps of a smaller type."""
     attributes: Mapping[str, Any] = field(default_factory=dict)
     inherited: Mapping[str, Any] = field(default_factory=dict)
     """Attributes of the groups that it is in and of the file, the nearest first."""
@@ -127,7 +120,7 @@ def image_of_arrays(
     what = image.name or "the array"
     size = _pixel_list_size(image, arrays, options)
     fixed = options.axes
-    shape, take = image.shape, image.take
+    shape = image.shape
     if len(image.shape) == 2:  # a list of pixels, column after column, or one band
         if size is None and options.size is not None:
             raise CaptureError(f"{path}: {what} {shape} is not a list of {prod(options.size)} pixels")
@@ -137,7 +130,6 @@ def image_of_arrays(
             shape, fixed = (image.shape[0], size[1], size[0]), "bxy"
         else:
             shape, fixed = (size[1], size[0], image.shape[1]), "xyb"
-        take = None
     elif len(image.shape) != 3:
         raise CaptureError(f"{path}: {what} has the shape {image.shape}; expected three axes")
     elif fixed is None:
@@ -160,11 +152,6 @@ def image_of_arrays(
     )
     dtype, no_data, valid = _measured_numbers(image, linear)
 
-    def read_part(rows: slice, wanted: BandIndex) -> np.ndarray:
-        if take is not None:
-            return take(axes, rows, wanted).astype(dtype, copy=False)
-        return take_part(image.whole().reshape(shape), axes, rows, wanted).astype(dtype, copy=False)
-
     others = [
         one.name
         for one in arrays
@@ -177,7 +164,7 @@ def image_of_arrays(
         reader=reader,
         shape=of_image,
         dtype=dtype,
-        read_part=read_part,
+        numbers=Numbers((image.numbers,), shape, axes, dtype),
         bands=bands,
         linear=linear,
         no_data=no_data,
@@ -285,7 +272,7 @@ def _pixel_list_size(
     size = options.size
     numbers = {one.own_name.rstrip("s"): one for one in arrays if one.is_vector and prod(one.shape) == 1}
     if size is None and "nrow" in numbers and "ncol" in numbers:
-        rows, columns = (float(numbers[name].whole().reshape(-1)[0]) for name in ("nrow", "ncol"))
+        rows, columns = (float(numbers[name].numbers.array().reshape(-1)[0]) for name in ("nrow", "ncol"))
         size = (int(rows), int(columns)) if 1 <= rows < 2**31 and 1 <= columns < 2**31 else None
     if len(array.shape) != 2 or size is None or prod(size) not in array.shape:
         return None
@@ -327,6 +314,12 @@ def _numbers_in_text(value: Any) -> Any:
     return value
 
 
+def describes_image(name: str) -> bool:
+    """Whether an array of this name, with its groups, may say something of an image beside it."""
+    own = name.rpartition("/")[2].lower()
+    return own in _AXES or own in _SIDES or is_exposure(own) or says_bands(own) or bool(NAMES.fullmatch(own))
+
+
 def _lists_bands(array: FoundArray) -> bool:
     """Whether it is called as a list of bands is, or a text as names of bands are."""
     is_named = NAMES.fullmatch(array.own_name) or _AXES.get(array.own_name) == "b"
@@ -364,7 +357,7 @@ def _lists_beside(arrays: Sequence[FoundArray], image: FoundArray) -> dict[str, 
 
 def _texts(array: FoundArray) -> list[Any]:
     """Texts of a list, or the items of a single one, as numbers where all are; of letters, a row is a text."""
-    stored = np.asarray(array.whole())
+    stored = np.asarray(array.numbers.array())
     letters = stored.ndim == 2 and stored.dtype == "S1"
     texts = [b"".join(row) for row in stored] if letters else stored.reshape(-1).tolist()
     return _numbers_in_text(_decoded(texts[0]) if len(texts) == 1 else texts)
@@ -372,7 +365,7 @@ def _texts(array: FoundArray) -> list[Any]:
 
 def _unpacked(array: FoundArray) -> list[Any]:
     """Numbers of a list, as CF packs any variable."""
-    stored: Any = array.whole().reshape(-1)
+    stored: Any = array.numbers.array().reshape(-1)
     gain, offset = (_first_number(array.attributes, name) for name in ("scale_factor", "add_offset"))
     stored = stored if gain is None else stored * gain
     return (stored if offset is None else stored + offset).tolist()

@@ -12,7 +12,7 @@ import numpy as np
 
 from unmix_plugin.captures.camera_tags import radiometric_model
 from unmix_plugin.captures.names import natural_order
-from unmix_plugin.captures.spectral_file import BandIndex, BandTable, Linear, SpectralFile, find_missing
+from unmix_plugin.captures.spectral_file import BandTable, Linear, SpectralFile
 from unmix_plugin.captures.wavelengths import wavelengths_in_names
 from unmix_plugin.errors import CaptureError, name_some
 from unmix_plugin.limits import allow_parts
@@ -99,19 +99,13 @@ def stack_bands(parts: Sequence[SpectralFile], path: Path) -> SpectralFile:
     differ = len({(repr(part.no_data), part.valid_range) for part in own}) > 1
     of_all = [number for part in parts for number in part.no_data if number == 0 or not differ]
 
-    def read_part(rows: slice, bands: BandIndex) -> np.ndarray:
-        return np.concatenate([parts[band].read(rows) for band in np.arange(len(parts))[bands]], axis=-1)
-
-    def missing_part(rows: slice, bands: BandIndex) -> np.ndarray:
-        chosen = [own[band] for band in np.arange(len(parts))[bands]]
-        return np.any([find_missing(part.read(rows), part, rows) for part in chosen], axis=0)
-
     return replace(
         first,
         path=path,
         shape=(*first.shape[:2], len(parts)),
         dtype=np.result_type(*(part.dtype for part in parts)),
-        read_part=read_part,
+        numbers=None,
+        parts=tuple(own),
         bands=_table_of([part.bands for part in parts]),
         linear=Linear(gains, offsets, stated[0].evidence) if stated else None,
         no_data=tuple(dict.fromkeys(of_all)),
@@ -121,7 +115,7 @@ def stack_bands(parts: Sequence[SpectralFile], path: Path) -> SpectralFile:
         warnings=tuple(warnings),
         sources=tuple(source for part in parts for source in part.files),
         dark_lines=0,
-        missing_part=missing_part if differ or any(part.missing_part for part in parts) else None,
+        masks=(),
     )
 
 

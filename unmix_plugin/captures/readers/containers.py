@@ -1,6 +1,6 @@
 """How NumPy, torch, NetCDF-3, HDF5 (with NetCDF-4 and MATLAB 7.3) and MATLAB 5 to 7 store arrays by name.
 
-Files are opened for each part that is read and closed again, so that many can be in use at a time.
+Files are opened to list their arrays and closed again, so that many can be in use at a time.
 """
 
 from __future__ import annotations
@@ -13,23 +13,25 @@ import zlib
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
-from itertools import count
+from itertools import count, product
 from math import prod
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Literal
 
 import numpy as np
 
-from unmix_plugin.captures.readers.arrays import UNREAD, UNREADABLE, FoundArray, image_of_arrays
+from unmix_plugin.captures.numbers import Block, Decoded, Held, Mapped
+from unmix_plugin.captures.readers.arrays import (
+    UNREAD,
+    UNREADABLE,
+    FoundArray,
+    describes_image,
+    image_of_arrays,
+)
 from unmix_plugin.captures.spectral_file import (
-    Axes,
-    BandIndex,
     ReadOptions,
     SpectralFile,
     import_extra,
-    loaded,
-    take_part,
 )
 from unmix_plugin.errors import CaptureError, counted
 from unmix_plugin.limits import (
@@ -43,7 +45,6 @@ from unmix_plugin.limits import (
 from unmix_plugin.scenes.reading.cubes import (
     READ_HEADER,
     UnreadableArrayError,
-    map_array,
     parse_header,
     read_array_header,
 )
@@ -63,7 +64,9 @@ def _list_npy(path: Path) -> list[FoundArray]:
         header = read_array_header(path)
     except UnreadableArrayError as error:
         raise CaptureError(f"{path}: {error}") from error
-    return [FoundArray("", header.shape, header.dtype, lambda: map_array(path))]
+    order = "F" if header.is_fortran else "C"
+    numbers = Mapped(path, header.dtype, header.shape, header.offset, order)
+    return [FoundArray("", header.shape, header.dtype, numbers)]
 
 
 def _list_npz(path: Path) -> list[FoundArray]:
@@ -77,20 +80,29 @@ def _list_npz(path: Path) -> list[FoundArray]:
                     raise CaptureError(
                         f"{path}: {info.filename} is .npy of version {version}; use numpy.savez"
                     )
-                shape, _, dtype = parse_header(file, version)
+                shape, is_fortran, dtype = parse_header(file, version)
             needed = int(np.prod(shape, dtype=object)) * dtype.itemsize
             if not dtype.hasobject and info.file_size < needed:
                 held = f"holds {info.file_size} bytes"
                 raise CaptureError(f"{path}: {info.filename} {held}; its header promises {needed}")
             allow_decoded(path, info.file_size, CaptureError, info.compress_size)
-            whole = partial(loaded, _load_npz_member, path, info.filename)
-            arrays.append(FoundArray(info.filename.removesuffix(".npy"), shape, dtype, whole))
+            order = "F" if is_fortran else "C"
+            numbers = Decoded(path, dtype, shape or (1,), _unpack_member, (info.filename,), order)
+            arrays.append(FoundArray(info.filename.removesuffix(".npy"), shape, dtype, numbers))
     return arrays
 
 
-def _load_npz_member(path: Path, name: str) -> np.ndarray:
+def _unpack_member(path: Path, numbers: np.ndarray, name: str) -> None:
+    flat = numbers.reshape(-1, order="A").view(np.uint8)
     with zipfile.ZipFile(path) as archive, archive.open(name) as file:
-        return np.lib.format.read_array(file, allow_pickle=False)
+        parse_header(file, np.lib.format.read_magic(file))
+        at = 0
+        while at < len(flat):
+            piece = file.read(min(_PIECE_BYTES, len(flat) - at))
+            if not piece:
+                raise CaptureError(f"{path}: {name} is cut short; copy the file again")
+            flat[at : at + len(piece)] = np.frombuffer(piece, np.uint8)
+            at += len(piece)
 
 
 # Tensors that torch.save wrote: read with weights_only, which loads no code.
@@ -98,37 +110,44 @@ def _load_npz_member(path: Path, name: str) -> np.ndarray:
 
 def _list_torch(path: Path) -> list[FoundArray]:
     """A tensor, or the tensors of a dictionary."""
-    import torch
-
     _check_pickle(path)
-
-    def tensors() -> dict[str, Any]:
-        """By name, mapped where the file allows it."""
-        with path.open("rb") as file:
-            is_mappable = file.read(2) == b"PK"
-        try:
-            content = torch.load(path, map_location="cpu", weights_only=True, mmap=is_mappable)
-        except pickle.UnpicklingError as error:
-            raise CaptureError(
-                f"{path}: holds other objects than tensors, which are never loaded because they can run code"
-            ) from error
-        named = content if isinstance(content, dict) else {"": content}
-        return {str(name): value for name, value in named.items() if isinstance(value, torch.Tensor)}
-
-    def numbers(tensor: torch.Tensor) -> np.ndarray:
-        """What NumPy has no type for becomes float32."""
-        tensor = tensor.detach()
-        return (tensor.float() if tensor.dtype == torch.bfloat16 else tensor.resolve_neg()).numpy()
-
-    found, arrays = tensors(), []
+    found, arrays = _tensors(path), []
     allow_parts(path, len(found), "tensors", CaptureError)
     for name, tensor in found.items():  # of which many numbers can be one in the file
         allow_decoded(path, tensor.numel() * tensor.element_size(), CaptureError)
-        dtype = numbers(tensor[:0] if tensor.ndim else tensor).dtype
+        dtype, shape = _as_array(tensor[:0] if tensor.ndim else tensor).dtype, tuple(tensor.shape)
         arrays.append(
-            FoundArray(name, tuple(tensor.shape), dtype, lambda name=name: numbers(tensors()[name]))
+            FoundArray(name, shape, dtype, Decoded(path, dtype, shape or (1,), _copy_tensor, (name,)))
         )
     return arrays
+
+
+def _tensors(path: Path) -> dict[str, Any]:
+    """By name, mapped where the file allows it."""
+    import torch
+
+    with path.open("rb") as file:
+        is_mappable = file.read(2) == b"PK"
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True, mmap=is_mappable)
+    except pickle.UnpicklingError as error:
+        raise CaptureError(
+            f"{path}: holds other objects than tensors, which are never loaded because they can run code"
+        ) from error
+    named = content if isinstance(content, dict) else {"": content}
+    return {str(name): value for name, value in named.items() if isinstance(value, torch.Tensor)}
+
+
+def _as_array(tensor: Any) -> np.ndarray:
+    """What NumPy has no type for becomes float32."""
+    import torch
+
+    tensor = tensor.detach()
+    return (tensor.float() if tensor.dtype == torch.bfloat16 else tensor.resolve_neg()).numpy()
+
+
+def _copy_tensor(path: Path, numbers: np.ndarray, name: str) -> None:
+    numbers[...] = _as_array(_tensors(path)[name])
 
 
 _MOST_OPERATIONS, _LONGEST_WORD = 1 << 20, 1024
@@ -159,7 +178,7 @@ def _check_pickle(path: Path) -> None:
             look(file)
 
 
-# NetCDF of the classic kind, mapped by SciPy; nothing holds on to the map of a file.
+# NetCDF of the classic kind, copied by SciPy, as the numbers of a variable need not stand together.
 
 _NETCDF_FILLS = {"i2": -32767.0, "i4": -2147483647.0, "f4": 9.969209968386869e36, "f8": 9.969209968386869e36}
 """Numbers of variables that were never written, by type. Source: NetCDF's netcdf.h, NC_FILL_SHORT and the like."""
@@ -168,26 +187,30 @@ _NETCDF_FILLS = {"i2": -32767.0, "i4": -2147483647.0, "f4": 9.969209968386869e36
 def _list_netcdf3(path: Path) -> list[FoundArray]:
     from scipy.io import netcdf_file
 
-    def numbers(name: str, take: Callable[[np.ndarray], np.ndarray] = np.array) -> np.ndarray:
-        with netcdf_file(str(path), "r", mmap=True) as file:
-            return take(file.variables[name].data)
-
     def found(name: str, variable: Any, root: dict[str, Any]) -> FoundArray:
-        def take(axes: Axes, rows: slice, bands: BandIndex) -> np.ndarray:
-            return numbers(name, lambda data: take_part(data, axes, rows, bands))
-
         shape, axes, attributes = variable.shape, variable.dimensions, dict(variable._attributes)
-        whole, kind = partial(numbers, name), variable.data.dtype
+        kind = variable.data.dtype
         fill = _NETCDF_FILLS.get(kind.str[1:])
-        return FoundArray(name, shape, kind, whole, take, attributes, root, axes, fill)
+        numbers = Decoded(path, kind, shape or (1,), _copy_variable, (name,))
+        return FoundArray(name, shape, kind, numbers, attributes, root, axes, fill)
 
     with netcdf_file(str(path), "r", mmap=True) as file:
         allow_parts(path, len(file.variables), "variables", CaptureError)
         return [found(name, variable, dict(file._attributes)) for name, variable in file.variables.items()]
 
 
-# HDF5, read by h5py in slices.
+def _copy_variable(path: Path, numbers: np.ndarray, name: str) -> None:
+    from scipy.io import netcdf_file
 
+    with netcdf_file(str(path), "r", mmap=True) as file:
+        numbers[...] = file.variables[name].data
+
+
+# HDF5: contiguous numbers are mapped, chunks are read by h5py, each once.
+
+_SMALL_TEXT_BYTES = 1 << 16
+_BLOCK_BYTES = 1 << 26
+"""Of a data set, that are decoded at once; more where a single chunk is larger."""
 _BARE_AXIS = "This is a netCDF dimension but not a netCDF variable"
 """What begins the attribute NAME of data sets that hold nothing. Source: netCDF-C, DIM_WITHOUT_VARIABLE."""
 
@@ -269,26 +292,59 @@ def _found_in_hdf5(
     if not is_cube and (item.external or item.is_virtual):
         return []
 
-    def whole() -> np.ndarray:
-        with import_extra("h5py").File(path, "r") as file:
-            stored = np.asarray(file[name][()])
-        if is_letters:
-            return np.array(["".join(map(chr, row)) for row in np.atleast_2d(stored.T)])
-        return stored.T if is_matlab else stored
-
-    def take(axes: Axes, rows: slice, bands: BandIndex) -> np.ndarray:
-        stored_axes = axes[::-1] if is_matlab else axes
-        selection = {"y": rows, "x": slice(None), "b": bands}
-        with import_extra("h5py").File(path, "r") as file:
-            part = file[name][tuple(selection[axis] for axis in stored_axes)]
-        return part.transpose([stored_axes.index(axis) for axis in "yxb"])
-
-    names, faster, fill = _axis_names(item), take if is_cube else None, None
+    names, fill = _axis_names(item), None
     if dtype.kind in "iuf":
         # HDF5 ends the process where a damaged value is asked for; asked whether there is one, it raises an error.
         item.id.get_create_plist().fill_value_defined()
         fill = float(item.fillvalue)
-    return [FoundArray(name, shape, dtype, whole, faster, attributes, inherited, names, fill)]
+    numbers = _hdf5_numbers(path, name, item, dtype, is_matlab, is_letters)
+    return [FoundArray(name, shape, dtype, numbers, attributes, inherited, names, fill)]
+
+
+def _hdf5_numbers(
+    path: Path, name: str, item: Any, dtype: np.dtype, is_matlab: bool, is_letters: bool
+) -> Block:
+    """Where the numbers of a data set are; texts are read at once."""
+    order: Literal["C", "F"] = "F" if is_matlab else "C"
+    shape = tuple(item.shape[::-1] if is_matlab else item.shape)
+    if dtype == UNREAD or (dtype == "O" and not describes_image(name)):
+        return Held(np.zeros(0))
+    if dtype == "O":
+        needed, is_stored = prod(shape) * item.dtype.itemsize, item.id.get_storage_size()
+        if needed > _SMALL_TEXT_BYTES:
+            allow_decoded(path, needed, CaptureError, is_stored)
+        stored = np.asarray(item[()])
+        if is_letters:
+            return Held(np.array(["".join(map(chr, row)) for row in np.atleast_2d(stored.T)]))
+        return Held(stored.T if is_matlab else stored)
+    if not shape:
+        return Held(np.atleast_1d(item[()]))
+    offset = item.id.get_offset() if item.chunks is None else None
+    if offset is not None and not item.external and not item.is_virtual:
+        return Mapped(path, item.dtype, shape, offset, order)
+    chunks = item.chunks or (1,) * item.ndim
+    units = chunks[::-1] if is_matlab else chunks
+    return Decoded(path, item.dtype, shape, _read_chunks, (name, is_matlab), order, units)
+
+
+def _read_chunks(path: Path, numbers: np.ndarray, axis: int, first: int, name: str, is_matlab: bool) -> None:
+    """Some numbers of a data set, in blocks of whole chunks, so that each chunk is decoded once."""
+    target, axis = (numbers.T, numbers.ndim - 1 - axis) if is_matlab else (numbers, axis)
+    with import_extra("h5py").File(path, "r") as file:
+        stored = file[name]
+        block = list(stored.chunks or stored.shape)
+        for other in reversed(range(len(block))):
+            fitting = _BLOCK_BYTES // max(1, prod(block) * stored.dtype.itemsize)
+            block[other] = min(target.shape[other], block[other] * max(1, fitting))
+        starts = (range(0, length, step) for length, step in zip(target.shape, block, strict=True))
+        for corner in product(*starts):
+            ends = [
+                min(one + step, length) for one, step, length in zip(corner, block, target.shape, strict=True)
+            ]
+            within = [slice(*both) for both in zip(corner, ends, strict=True)]
+            of_file = [*within]
+            of_file[axis] = slice(first + corner[axis], first + ends[axis])
+            target[tuple(within)] = stored[tuple(of_file)]
 
 
 def _axis_names(item: Any) -> tuple[str, ...] | None:
@@ -386,22 +442,17 @@ def _found_in_matlab(
     if own not in _CLASSES or flags & _IS_COMPLEX:
         texts = _matlab_texts(head, order, end, shape) if own == _LETTERS else []
         found = np.array(texts) if texts else np.zeros((), UNREAD)
-        return [FoundArray(name, found.shape, found.dtype, lambda: found)] if name else []
+        return [FoundArray(name, found.shape, found.dtype, Held(found))] if name else []
     kind, size, at, _ = _tag(head, order, end)
     if kind not in _STORED or min(shape, default=-1) < 0:
         raise ValueError(f"variable '{name}' has the type {kind} and the shape {shape}")
     stored, dtype, offset = np.dtype(order + _STORED[kind]), np.dtype(_CLASSES[own]), start + at
     if prod(shape) * stored.itemsize != size or at + size > length:
         raise ValueError(f"variable '{name}' of {shape} {stored.name} has {size} bytes")
-    if packed is not None:
-        needed = prod(shape) * max(stored.itemsize, dtype.itemsize)
-        allow_decoded(path, needed, CaptureError, packed[1])
-
-    def numbers() -> np.ndarray:
-        if packed is not None:
-            return loaded(_unpack, path, name, shape, stored, offset, packed)
-        return np.memmap(path, stored, "r", offset, shape, order="F")
-
+    if packed is None:
+        return [FoundArray(name, shape, dtype, Mapped(path, stored, shape, offset, "F"))]
+    allow_decoded(path, prod(shape) * max(stored.itemsize, dtype.itemsize), CaptureError, packed[1])
+    numbers = Decoded(path, stored, shape, _unpack, (name, offset, packed), "F")
     return [FoundArray(name, shape, dtype, numbers)]
 
 
@@ -426,13 +477,10 @@ def _tag(head: bytes, order: str, position: int) -> tuple[int, int, int, int]:
     return kind, length, position + 8, position + 8 + length + (-length % 8)
 
 
-def _unpack(
-    path: Path, name: str, shape: tuple[int, ...], stored: np.dtype, offset: int, packed: tuple[int, int]
-) -> np.ndarray:
+def _unpack(path: Path, numbers: np.ndarray, name: str, offset: int, packed: tuple[int, int]) -> None:
     """The numbers of a compressed variable, unpacked piece by piece to where they stay, and no more than it needs."""
     start, left = packed
-    numbers = np.zeros(prod(shape), stored)
-    target, at, unpacking = numbers.view(np.uint8), -offset, zlib.decompressobj()
+    target, at, unpacking = numbers.reshape(-1, order="F").view(np.uint8), -offset, zlib.decompressobj()
     with path.open("rb") as file:
         file.seek(start)
         while at < len(target):
@@ -446,7 +494,6 @@ def _unpack(
             wanted = piece[max(0, -at) : len(target) - at]
             target[max(0, at) : max(0, at) + len(wanted)] = np.frombuffer(wanted, np.uint8)
             at += len(piece)
-    return numbers.reshape(shape, order="F")
 
 
 KINDS: dict[str, tuple[str, Callable[[Path], list[FoundArray]]]] = {

@@ -6,10 +6,9 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from unmix_plugin.captures.header_values import check_bands, exposure_facts, listed, state_bands, state_linear
-from unmix_plugin.captures.spectral_file import BandIndex, ReadOptions, SpectralFile, take_part
+from unmix_plugin.captures.numbers import Mapped, Numbers
+from unmix_plugin.captures.spectral_file import ReadOptions, SpectralFile
 from unmix_plugin.errors import CaptureError, counted
 from unmix_plugin.formats.envi import (
     MAP_KEYS,
@@ -75,12 +74,15 @@ def open_envi(path: Path, _: ReadOptions) -> SpectralFile:
     except ValueError as error:
         raise CaptureError(f"{header_path}: {error}") from error
     size_warnings = _check_size(header_path, data_path, layout)
+    lengths = dict(zip("yxb", layout.shape, strict=True))
+    stored = tuple(lengths[axis] for axis in layout.axes)
+    numbers = Mapped(data_path, layout.dtype, stored, layout.offset)
     plain = SpectralFile(
         path=header_path,
         reader="envi",
         shape=layout.shape,
         dtype=layout.dtype,
-        read_part=lambda rows, wanted: _read_part(data_path, layout, rows, wanted),
+        numbers=Numbers((numbers,), stored, layout.axes, layout.dtype),
         interleave=layout.interleave,
         warnings=layout.notes + size_warnings,
         sources=(data_path,),
@@ -178,17 +180,6 @@ def _numbers(header: dict[str, str], key: str, otherwise: str, warnings: list[st
     except ValueError:
         warnings.append(f"'{key}' is {header[key]}, no number: {otherwise}")
         return []
-
-
-def _read_part(data_path: Path, layout: EnviLayout, rows: slice, bands: BandIndex) -> np.ndarray:
-    """Map, copy and let go, so that many files can be open at a time."""
-    found = data_path.stat().st_size
-    if found < layout.num_bytes:  # touching a map beyond the end of its file would end the process
-        raise CaptureError(f"{data_path}: {found} bytes are left of {layout.num_bytes}; the file was cut")
-    lengths = dict(zip("yxb", layout.shape, strict=True))
-    shape = tuple(lengths[axis] for axis in layout.axes)
-    stored = np.memmap(data_path, layout.dtype, "r", layout.offset, shape)
-    return take_part(stored, layout.axes, rows, bands)
 
 
 def _check_size(header_path: Path, data_path: Path, layout: EnviLayout) -> tuple[str, ...]:

@@ -28,7 +28,8 @@ from jaxtyping import Int
 
 from unmix_plugin.captures.header_values import exposure_facts
 from unmix_plugin.captures.names import natural_order
-from unmix_plugin.captures.spectral_file import BandTable, ReadOptions, SpectralFile, loaded
+from unmix_plugin.captures.numbers import Decoded, Numbers
+from unmix_plugin.captures.spectral_file import BandTable, ReadOptions, SpectralFile
 from unmix_plugin.captures.wavelengths import PLAUSIBLE_NM, wavelengths_in_names
 from unmix_plugin.errors import CaptureError, name_some
 from unmix_plugin.limits import allow_decoded, allow_parts
@@ -128,12 +129,15 @@ def open_exr(path: Path, options: ReadOptions) -> SpectralFile:
         for index, (title, part) in enumerate(zip(titles, parts, strict=True))
     ]
     keys = tuple((channel.part, channel.name) for channel in chosen)
+    dtype = np.result_type(dtype, np.float16) if is_partial else dtype
+    height, width = (frame[1] - frame[0])[::-1].tolist()
+    planes = len(chosen), height, width
     return SpectralFile(
         path=path,
         reader="exr",
-        shape=(*(frame[1] - frame[0])[::-1].tolist(), len(chosen)),
-        dtype=np.result_type(dtype, np.float16) if is_partial else dtype,
-        read_part=lambda rows, wanted: np.moveaxis(loaded(_load_exr, path, keys)[wanted][:, rows], 0, -1),
+        shape=(height, width, len(chosen)),
+        dtype=dtype,
+        numbers=Numbers((Decoded(path, dtype, planes, _decode, (keys,)),), planes, "byx", dtype),
         bands=table,
         notes=("the data window is a part of the picture: pixels outside are missing",) if is_partial else (),
         warnings=tuple(warnings),
@@ -294,21 +298,18 @@ def _number(text: str) -> float:
     return float(text.replace(",", "."))
 
 
-def _load_exr(path: Path, keys: tuple[tuple[int, str], ...]) -> np.ndarray:
+def _decode(path: Path, planes: np.ndarray, keys: Sequence[tuple[int, str]]) -> None:
     """Channels (B, H, W) by part and name, on the display window; NaN where a part has no pixels."""
-    parts, channels = _opened(path).parts, []
+    parts = _opened(path).parts
     frame = _window(parts[keys[0][0]].header, "displayWindow")
-    for index, name in keys:
+    for plane, (index, name) in zip(planes, keys, strict=True):
         pixels, window = parts[index].channels[name].pixels, _window(parts[index].header, "dataWindow")
         if (window != frame).any():
-            placed = np.full((frame[1] - frame[0])[::-1], np.nan, np.result_type(pixels.dtype, np.float16))
-            low, high = _on_both(window, frame)
-            (x, y), (right, bottom) = low - frame[0], high - frame[0]
-            (left, top), (width, height) = low - window[0], high - low
-            placed[y:bottom, x:right] = pixels[top : top + height, left : left + width]
-            pixels = placed
-        channels.append(pixels)
-    return np.stack(channels)
+            plane[:] = np.nan
+        low, high = _on_both(window, frame)
+        (x, y), (right, bottom) = low - frame[0], high - frame[0]
+        (left, top), (width, height) = low - window[0], high - low
+        plane[y:bottom, x:right] = pixels[top : top + height, left : left + width]
 
 
 def _opened(path: Path, **options: bool) -> Any:

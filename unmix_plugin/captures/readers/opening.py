@@ -147,12 +147,8 @@ def _with_mask_beside(file: SpectralFile) -> SpectralFile:
             )
             file = replace(file, warnings=(*file.warnings, warning))
             continue
-        one = mask.shape[2] == 1
-        file = with_mask(
-            replace(file, sources=(*file.sources, path)),
-            path.name,
-            lambda rows, bands, mask=mask, one=one: mask.read(rows, slice(None) if one else bands),
-        )
+        if mask.numbers is not None:
+            file = with_mask(replace(file, sources=(*file.sources, path)), path.name, mask.numbers)
     return file
 
 

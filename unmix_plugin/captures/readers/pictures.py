@@ -12,13 +12,13 @@ import numpy as np
 
 from unmix_plugin.captures.camera_tags import parse_xmp, with_camera_tags
 from unmix_plugin.captures.header_values import exposure_facts
+from unmix_plugin.captures.numbers import Decoded, Numbers
 from unmix_plugin.captures.spectral_file import (
     COLOURS_AS_STORED,
     BandTable,
     ReadOptions,
     SpectralFile,
     import_extra,
-    loaded,
 )
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.limits import allow_decoded
@@ -67,12 +67,13 @@ def open_picture(path: Path, _: ReadOptions) -> SpectralFile:
     metadata |= exposure_facts(exposed, "tag", warnings)
     if alpha:
         metadata["has_alpha"] = True
+    size = height, width, num_bands
     return SpectralFile(
         path=path,
         reader="picture",
-        shape=(height, width, num_bands),
+        shape=size,
         dtype=dtype,
-        read_part=lambda rows, wanted: loaded(_load, path, deep)[rows][..., wanted],
+        numbers=Numbers((Decoded(path, dtype, size, _decode, (deep,)),), size, "yxb", dtype),
         bands=bands,
         interleave="bip" if num_bands == 3 else None,
         notes=("the picture has opacity, which is not a band and is left out",) if alpha else (),
@@ -81,14 +82,18 @@ def open_picture(path: Path, _: ReadOptions) -> SpectralFile:
     )
 
 
-def _load(path: Path, deep: int) -> np.ndarray:
+def _decode(path: Path, numbers: np.ndarray, deep: int) -> None:
     """Numbers (H, W, 1 or 3), neither turned nor linearised; of a PNG of 16 bits so many bands."""
     from PIL import Image
 
     if deep:
-        return import_extra("imagecodecs").png_decode(path.read_bytes())[..., :deep]
+        numbers[:] = (
+            import_extra("imagecodecs").png_decode(path.read_bytes())[..., :deep].reshape(numbers.shape)
+        )
+        return
     with Image.open(path, formats=("PNG", "JPEG")) as picture:
         if picture.mode in _GREY:
             grey = picture.convert("L") if picture.mode in ("1", "LA") else picture
-            return np.asarray(grey).astype(_GREY[picture.mode])[..., None]
-        return np.asarray(picture.convert("RGB"))
+            numbers[..., 0] = np.asarray(grey).astype(_GREY[picture.mode])
+        else:
+            numbers[:] = np.asarray(picture.convert("RGB"))

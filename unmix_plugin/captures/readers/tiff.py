@@ -1,6 +1,6 @@
 """TIFF and GeoTIFF images: bands as pages, as planes, or beside each other in each pixel.
 
-Of the strips or tiles of a page only those that are asked for are read and decoded. What the file says of its bands
+Uncompressed pages are mapped; of compressed ones each strip or tile is decoded once. What the file says of its bands
 stands in GDAL's metadata, in the description of the image, in the names of pages, or in a camera's tags.
 
 Notation: `H` rows, `W` columns, `B` bands, `S` samples (numbers of a pixel).
@@ -18,22 +18,20 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
 from unmix_plugin.captures.camera_tags import camera_tags, with_camera_tags
 from unmix_plugin.captures.header_values import StatedBands, check_bands, exposure_facts, state_bands
+from unmix_plugin.captures.numbers import Axes, Block, Decoded, Mapped, Numbers
 from unmix_plugin.captures.readers.arrays import choose_axes, image_shape
 from unmix_plugin.captures.readers.gdal import gdal_entries, gdal_items, gdal_linear, gdal_number
 from unmix_plugin.captures.spectral_file import (
     COLOURS_AS_STORED,
-    Axes,
-    BandIndex,
     ReadOptions,
     SpectralFile,
     import_extra,
-    take_part,
     with_mask,
 )
 from unmix_plugin.errors import CaptureError, counted
@@ -87,6 +85,30 @@ class _Stack:
     no_data: tuple[float, ...] = ()
     """Stored numbers that stand for no measurement."""
 
+    def numbers(self, path: Path, axes: Axes) -> Numbers:
+        """Pages as they lie in the file, or all decoded where one of them is compressed."""
+        planes, _, height, width, samples = self.pages[0].shaped
+        shape, of_page = self.shape, self.shape[1:]
+        if len(self.pages) == 1 and self.unlisted_from is None:
+            shape, axes = (
+                ((planes, height, width), "byx") if planes > 1 else ((height, width, samples), "yxb")
+            )
+            of_page = shape
+        blocks: tuple[Block, ...]
+        if self.unlisted_from is not None:
+            blocks = (Mapped(path, self.dtype, shape, self.unlisted_from),)
+        elif all(map(_is_mappable, self.pages)):
+            blocks = tuple(Mapped(path, self.dtype, of_page, page.dataoffsets[0]) for page in self.pages)
+        else:
+            offsets = tuple(page.offset for page in self.pages)
+            native = self.dtype.newbyteorder("=")
+            rows = math.gcd(*(page.chunks[0] for page in self.pages if page.chunks))
+            units = (1, rows, width) if len(self.pages) > 1 else (planes, rows, width)
+            units = units if len(self.pages) > 1 or planes > 1 else (rows, width, samples)
+            given = offsets, repr(self.fill)
+            blocks = (Decoded(path, native, shape, _decode_pages, given, units=units),)
+        return Numbers(blocks, shape, axes, self.dtype)
+
 
 def open_tiff(path: Path, options: ReadOptions) -> SpectralFile:
     """Open an image whose bands are pages, planes or samples. Raises CaptureError: pages contradict each other, or the
@@ -137,7 +159,7 @@ def open_tiff(path: Path, options: ReadOptions) -> SpectralFile:
         reader="tiff",
         shape=shape,
         dtype=stack.dtype,
-        read_part=lambda rows, wanted: _read_part(path, stack, axes, rows, wanted),
+        numbers=stack.numbers(path, axes),
         bands=with_camera_tags(bands, tags["xmp"], shape[2]),
         interleave=interleave,
         linear=linear,
@@ -305,11 +327,7 @@ def _with_mask_page(opened: SpectralFile, page: TiffPage) -> SpectralFile:
     if opened.shape[:2] != page.shaped[2:4]:  # rows or columns are pages
         return opened
     stack = _Stack([page], (*opened.shape[:2], 1), np.dtype(page.dtype).newbyteorder(page.parent.byteorder))
-
-    def read_mask(rows: slice, _: BandIndex) -> np.ndarray:
-        return _read_page(opened.path, page, stack, rows, slice(0, 1))
-
-    return with_mask(opened, f"the mask in page {page.index}", read_mask)
+    return with_mask(opened, f"the mask in page {page.index}", stack.numbers(opened.path, "yxb"))
 
 
 def _check_page(path: Path, page: TiffPage, file_size: int) -> None:
@@ -332,7 +350,6 @@ def _check_page(path: Path, page: TiffPage, file_size: int) -> None:
         end = max(end, page.dataoffsets[0] + page.nbytes)
     if end > file_size:
         raise CaptureError(f"{where}: cut short: its numbers reach to byte {end} of {file_size}")
-    _ = page.decode, page.jpegtables  # read now, as the file is closed afterwards
 
 
 def _is_mappable(page: TiffPage) -> bool:
@@ -341,55 +358,50 @@ def _is_mappable(page: TiffPage) -> bool:
     return is_plain and page.is_contiguous and page.dataoffsets[0] > 0
 
 
-def _read_part(path: Path, stack: _Stack, axes: Axes, rows: slice, bands: BandIndex) -> np.ndarray:
-    if stack.unlisted_from is not None:
-        stored = np.memmap(path, stack.dtype, "r", stack.unlisted_from, stack.shape)
-        return take_part(stored, axes, rows, bands)
-    if len(stack.pages) == 1:
-        return _read_page(path, stack.pages[0], stack, rows, bands)
-    wanted = {"y": rows, "x": slice(None), "b": bands}
-    of_page = rows if axes[1] == "y" else slice(0, stack.shape[1], 1)
-    indices = np.arange(stack.shape[0])[wanted[axes[0]]]
-    one = slice(0, 1, 1)
-    planes = np.stack([_read_page(path, stack.pages[i], stack, of_page, one)[..., 0] for i in indices])
-    left = {axis: slice(None) if axis == axes[0] or axes[1] == axis == "y" else wanted[axis] for axis in "yb"}
-    return take_part(planes, axes, left["y"], left["b"])
+def _decode_pages(
+    path: Path, numbers: np.ndarray, axis: int, first: int, offsets: tuple[int, ...], fill: str
+) -> None:
+    """Each strip or tile of some rows, or of some pages, once: into (pages, H, W), or of a single page into (H, W, S)
+    or (S, H, W).
+
+    Args:
+        offsets: Where the entries of the pages lie.
+        fill: What strips and tiles read as that are not in the file, a number.
+    """
+    tifffile = import_extra("tifffile")
+    numbers[:] = float(fill) if numbers.dtype.kind == "f" else int(float(fill))
+    is_of_pages = len(offsets) > 1 and axis == 0
+    chosen = offsets[first : first + len(numbers)] if is_of_pages else offsets
+    with tifffile.TiffFile(path) as file, path.open("rb") as data:
+        for index, offset in enumerate(chosen):
+            file.filehandle.seek(offset)
+            page = tifffile.TiffPage(file, index=index)
+            planes, _, height, width, samples = page.shaped
+            image = numbers if len(offsets) == 1 else numbers[index]
+            image = image.reshape(planes, -1, width, samples)
+            top = 0 if is_of_pages else first
+            down, across = page.chunks[0], -(-width // page.chunks[1])
+            per_plane = -(-height // down) * across
+            strips = range(top // down * across, -(-(top + image.shape[1]) // down) * across)
+            for plane in range(planes):
+                for strip in strips:
+                    _decode_strip(data, page, plane * per_plane + strip, image, top)
 
 
-def _read_page(path: Path, page: TiffPage, stack: _Stack, rows: slice, samples: BandIndex) -> np.ndarray:
-    """Numbers (h, W, s) of some rows and samples, in the normal form of `SpectralFile.read`."""
-    num_planes, _, height, width, num_samples = page.shaped
-    if _is_mappable(page):
-        whole = (num_planes, height, width, num_samples)
-        image = np.memmap(path, stack.dtype, "r", page.dataoffsets[0], whole)[:, rows]
-        chosen = image[0][..., samples] if num_planes == 1 else np.moveaxis(image[..., 0][samples], 0, -1)
-        return np.array(chosen, order="C")
-    planes = np.arange(num_planes)[samples].tolist() if num_planes > 1 else [0]
-    # (p, h, W, S): of each plane that is wanted
-    block = np.full((len(planes), rows.stop - rows.start, width, num_samples), stack.fill, page.dtype)
-    down, across = page.chunks[0], -(-width // page.chunks[1])
-    per_plane = -(-height // down) * across
-    with path.open("rb") as file:
-        for at, plane in enumerate(planes):
-            for within in range(rows.start // down * across, -(-rows.stop // down) * across):
-                _decode_into(block[at], rows.start, file, page, plane * per_plane + within)
-    return block[0][..., samples] if num_planes == 1 else np.moveaxis(block[..., 0], 0, -1)
-
-
-def _decode_into(block: np.ndarray, first_row: int, file: Any, page: TiffPage, index: int) -> None:
-    """Copy what of a strip or tile lies in the block, whose first row is `first_row` of the image."""
-    file.seek(page.dataoffsets[index])
-    data = file.read(page.databytecounts[index])
-    if len(data) < page.databytecounts[index]:
-        raise CaptureError(f"{file.name}: cut short in strip or tile {index}; copy the file again")
-    decoded: Any = page.decode(data or None, index, jpegtables=page.jpegtables)
-    values, (_, _, top, left, _), _ = decoded
+def _decode_strip(data: BinaryIO, page: TiffPage, index: int, image: np.ndarray, first: int) -> None:
+    """Copy a strip or tile to its place in (planes, h, W, S), whose first row is `first` of the page."""
+    data.seek(page.dataoffsets[index])
+    stored = data.read(page.databytecounts[index])
+    if len(stored) < page.databytecounts[index]:
+        raise CaptureError(f"{data.name}: cut short in strip or tile {index}; copy the file again")
+    decoded: Any = page.decode(stored or None, index, jpegtables=page.jpegtables)
+    values, (plane, _, top, left, _), _ = decoded
     if values is None:  # left out in the file
         return
-    skip = max(0, first_row - top)
-    to = top + skip - first_row
-    part = values[0, skip : skip + len(block) - to, : block.shape[1] - left]
-    block[to : to + len(part), left : left + part.shape[1]] = part
+    above = max(0, first - top)
+    place = image[plane, top + above - first :, left:]
+    part = values[0, above : above + place.shape[0], : place.shape[1]]
+    place[: part.shape[0], : part.shape[1]] = part
 
 
 def _text(page: TiffPage, tag: int) -> str:

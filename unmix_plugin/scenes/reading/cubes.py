@@ -68,6 +68,10 @@ class _ArrayHeader:
     """Axis lengths."""
     dtype: np.dtype
     """Float or integer type."""
+    offset: int
+    """Bytes before the first value."""
+    is_fortran: bool
+    """Whether the first axis runs fastest."""
 
 
 def read_array_header(path: Path) -> _ArrayHeader:
@@ -82,10 +86,11 @@ def read_array_header(path: Path) -> _ArrayHeader:
         if version not in READ_HEADER:
             raise UnreadableArrayError(f"is a .npy file of version {version}; write it with numpy.save")
         try:
-            shape, _, dtype = parse_header(file, version)
+            shape, is_fortran, dtype = parse_header(file, version)
         except Exception as error:  # numpy raises SyntaxError, TokenError, ValueError... for a damaged header
             raise UnreadableArrayError("has a damaged .npy header; write it again") from error
-        found_bytes = path.stat().st_size - file.tell()
+        offset = file.tell()
+        found_bytes = path.stat().st_size - offset
     if not all(type(length) is int and length >= 0 for length in shape):
         raise UnreadableArrayError(f"has the shape {shape} in its .npy header; write it again")
     if dtype.hasobject:
@@ -96,7 +101,7 @@ def read_array_header(path: Path) -> _ArrayHeader:
     if found_bytes < expected_bytes:
         expected = f"{expected_bytes} expected for shape {shape}"
         raise UnreadableArrayError(f"is cut short: {found_bytes} bytes of values found, {expected}")
-    return _ArrayHeader(shape, dtype)
+    return _ArrayHeader(shape, dtype, offset, is_fortran)
 
 
 def parse_header(file: Any, version: tuple[int, int]) -> tuple[tuple[int, ...], bool, np.dtype]:
