@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from unmix_plugin.engine.decisions import Decision
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.engine.machine import step_generator
@@ -36,7 +37,9 @@ from unmix_plugin.scenes.geometry.lighting import judge_exposure, judge_light
 from unmix_plugin.scenes.geometry.matched_points import find_matched_points
 from unmix_plugin.scenes.geometry.surface_evidence import SurfaceEvidence
 from unmix_plugin.scenes.geometry.view_agreement import (
-    check_scene_poses,
+    compare_scene_conventions,
+    convention_decision,
+    describe,
     lens_warning,
     parallax_warning,
     training_views,
@@ -221,10 +224,19 @@ class HyperspectralDataManager(DataManager):
         """Why the world is taken to end with the scene box or not, where that was found."""
         return [] if self.scene.world_reason is None else [self.scene.world_reason]
 
+    def decisions(self) -> list[Decision]:
+        """Convention of poses, backdrop, and what lies behind the box."""
+        return [convention_decision(self._conventions), *self.scene.decisions]
+
+    @cached_property
+    def _conventions(self) -> dict[str, float]:
+        """How little the training views agree under each convention of poses."""
+        return compare_scene_conventions(self.scene)
+
     def warnings(self) -> list[str]:
         """Poses that seem to follow another convention, cameras far off or at one place, masks that contradict
         each other, a backdrop, sensors that share no band or no place with another, and bad bands and values."""
-        found = [check_scene_poses(self.scene) or self._carved[1], *self._pixels.notes, *self.scene.warnings]
+        found = [describe(self._conventions) or self._carved[1], *self._pixels.notes, *self.scene.warnings]
         found.append(parallax_warning(self._initial_data["knots"], self.scene_box))
         found.append(lens_warning(self.train_cameras))
         found += noise_warnings(self.scene, self._noise, self._pixels.bad_share)

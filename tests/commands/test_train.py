@@ -49,6 +49,24 @@ def test_a_run_holds_its_settings_its_scene_a_checkpoint_and_its_endmembers(trai
     np.testing.assert_allclose(table.bands.centers_nm, model.metadata["wavelengths_nm"], rtol=1e-8)
 
 
+def test_explain_prints_what_a_training_would_decide_and_writes_nothing(trained, tmp_path):
+    ended = done(train, *small_training(trained, tmp_path / "out", "--explain"))
+    assert not (tmp_path / "out").exists()
+    lines = ended.out.splitlines()
+    [poses] = [number for number, line in enumerate(lines) if line.startswith("poses ")]
+    table = lines[poses:]
+    assert any("against" in line and "another convention" in line for line in table)
+    assert any(line.startswith("light ") for line in table)
+    assert any(line.endswith("--pipeline.model.light") for line in table)
+    log = (trained.run / "run.log").read_text()
+    assert all(line.rstrip() in log for line in table)  # a training keeps the same table
+
+
+def test_explain_refuses_a_run_to_go_on_with(trained):
+    said = refused(train, "unmix-nerf", "--load-run", trained.run, "--explain")
+    assert "run.log" in str(said)
+
+
 def test_words_work_right_after_the_method_and_common_settings_have_short_names(tmp_path):
     argv = f"unmix-nerf --data {tmp_path} --output-dir out --max-num-iterations 5 --max-seconds 7.5 --seed 3"
     argv += f" --endmembers 4 --endmember-init file --endmember-file {tmp_path} --value-scale 4095"

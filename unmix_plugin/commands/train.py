@@ -30,11 +30,13 @@ if TYPE_CHECKING:
     from unmix_plugin.scenes.scene import Scene
 
 
-_PROGRAM = "unmix-train"
+_PROGRAM, _EXPLAIN = "unmix-train", "--explain"
 _USAGE = f"""usage: {_PROGRAM} METHOD --data DIR [options]
        {_PROGRAM} METHOD --load-run RUN [options]
+       {_PROGRAM} METHOD --data DIR --explain [options]
 
-Train a method on a folder of posed spectral images (--data demo: the built-in scene), or go on with a run.
+Train a method on a folder of posed spectral images (--data demo: the built-in scene), or go on with a run. With
+--explain, decide all that a training would decide from the images, print it with the evidence, and train nothing.
 """
 
 
@@ -60,10 +62,11 @@ def parse(argv: Sequence[str]) -> tuple[TrainerConfig, TrainingViewerOptions]:
         )
     name, options = argv[0], list(argv[1:])
     method = find_method(name)
+    explains = f" {_EXPLAIN} prints all decisions and trains nothing."
     if "--help-all" in options:
-        _parse(method, method.config, ["--help"], lambda marks: Hidden not in marks)
+        _parse(method, method.config, ["--help"], lambda marks: Hidden not in marks, explains)
     if {"--help", "-h"} & set(options):
-        ending = " --help-all lists all options, also those of the viewer."
+        ending = f" --help-all lists all options, also those of the viewer;{explains}"
         _parse(method, method.config, ["--help"], lambda marks: Common in marks, ending)
     given = tyro.cli(
         _Given, args=options, prog=f"{_PROGRAM} {name}", return_unknown_args=True, add_help=False
@@ -125,6 +128,9 @@ def train(argv: list[str]) -> None:
             tell(f"  {name:{width}}  {method.description}")
         tell(f"\n{_PROGRAM} METHOD --help lists the common options of a method, --help-all all of them.")
         return
+    if _EXPLAIN in argv:
+        explain(parse([word for word in argv if word != _EXPLAIN])[0])
+        return
     config, viewing = parse(argv)
 
     from unmix_plugin.commands.reporting import shell_line
@@ -151,6 +157,24 @@ def train(argv: list[str]) -> None:
                 tell(f"run: {stop.run}")
                 sys.exit(INTERRUPTED)
         tell(f"run: {trainer.run.path}")
+
+
+def explain(config: TrainerConfig) -> None:
+    """Read the scene, print what a training would decide from it and its warnings; nothing is written. ConfigError for
+    a run to go on with, whose decisions are in its run.log."""
+    from unmix_plugin.commands.reporting import announce_kernel_compilation, working
+    from unmix_plugin.engine.decisions import decision_table
+    from unmix_plugin.engine.training.progress import ProgressConsole
+    from unmix_plugin.engine.training.steps import prepare_steps
+
+    if config.load_run is not None:
+        raise ConfigError(
+            f"--explain decides for a new run; what {config.load_run} decided is in its run.log"
+        )
+    console = ProgressConsole()
+    with working(console, f"reading {config.data}"), announce_kernel_compilation(console):
+        pipeline = prepare_steps(config)[1].pipeline
+    tell("\n".join([*pipeline.reasons.splitlines(), "", *decision_table(pipeline.decisions)]))
 
 
 @contextmanager

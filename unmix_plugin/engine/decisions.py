@@ -7,8 +7,8 @@ answer: then the safer course is taken, and the table says so.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from typing import Any
 
 UNDECIDED = "undecided"
@@ -38,6 +38,29 @@ class Decision:
     def to_json(self) -> dict[str, Any]:
         """For a record."""
         return {**asdict(self), "evidence": dict(self.evidence)}
+
+
+def settled_settings(before: Any, after: Any, path: str) -> Iterator[Decision]:
+    """A decision for each setting that was `auto` and has a value now.
+
+    Args:
+        before, after: Settings, dataclasses of one class that may hold others.
+        path: Of their flags, such as `pipeline.model`.
+    """
+    for entry in fields(before):
+        old, new = getattr(before, entry.name), getattr(after, entry.name)
+        name = f"{path}.{entry.name}".replace("_", "-")
+        if is_dataclass(old) and type(old) is type(new):
+            yield from settled_settings(old, new, name)
+        elif isinstance(old, str) and old == "auto" and new != old:
+            yield Decision(entry.name.replace("_", "-"), _brief(new), flag=f"--{name}")
+
+
+def _brief(value: Any) -> str:
+    if isinstance(value, tuple):
+        shown = ", ".join(f"{each:.3g}" if isinstance(each, float) else str(each) for each in value[:3])
+        return f"{shown}, ... ({len(value)})" if len(value) > 3 else shown or "none"
+    return str(value)
 
 
 def decision_table(decisions: Sequence[Decision]) -> list[str]:

@@ -19,6 +19,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from unmix_plugin.engine.configs import DataManagerConfig, ModelConfig
+from unmix_plugin.engine.decisions import Decision
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
 from unmix_plugin.engine.processes import ALONE, Processes
@@ -104,6 +105,10 @@ class DataManager(ABC):
 
     def reasons(self) -> list[str]:
         """What was decided by the data, and why, in words; asked once, when a new run starts."""
+        return []
+
+    def decisions(self) -> list[Decision]:
+        """The same with evidence and what was tried against each; asked once, when a new run starts."""
         return []
 
     def warnings(self) -> list[str]:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from unmix_plugin.engine.configs import PipelineConfig
+from unmix_plugin.engine.decisions import Decision, settled_settings
 from unmix_plugin.engine.machine import seed_everything, step_generator, step_seed
 from unmix_plugin.engine.model import DataManager, Model, TrainOutputs
 
@@ -25,7 +26,7 @@ class Pipeline(nn.Module):
     def __init__(self, config: PipelineConfig, *, data: Path, device: torch.device, seed: int = 0) -> None:
         """Read the scene, then make the model for it, with parameters not yet initialised from the scene.
 
-        Afterwards `config` has no `auto` left, and `reasons` says why.
+        Afterwards `config` has no `auto` left; `decisions` lists what they became, and `reasons` says why.
 
         Raises:
             SceneError: the scene is missing or malformed.
@@ -38,16 +39,18 @@ class Pipeline(nn.Module):
             self.datamanager.initial_data, torch.Generator().manual_seed(seed)
         )
         self.config = replace(config, model=model_config)
+        self.decisions: list[Decision] = list(settled_settings(config.model, model_config, "pipeline.model"))
         self.model: Model = model_config.setup(
             scene_box=self.datamanager.scene_box, metadata=self.datamanager.metadata()
         ).to(device)
 
     def initialise(self) -> None:
-        """Let the model of a new run take its first values from the scene; what the data manager decided and all
-        warnings join `reasons`."""
+        """Let the model of a new run take its first values from the scene; what the data manager decided joins
+        `decisions` and `reasons`, and all warnings join the latter."""
         with torch.no_grad():
             self.model.initialise(self.datamanager.initial_data(), torch.Generator().manual_seed(self.seed))
         self.reasons = "\n".join(filter(None, [*self.datamanager.reasons(), self.reasons]))
+        self.decisions = [*self.datamanager.decisions(), *self.decisions]
         self.warn(*self.datamanager.warnings(), *self.model.warnings())
 
     def warn(self, *said: str) -> None:

@@ -13,7 +13,12 @@ from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes.demo.scene import make_demo_scene
 from unmix_plugin.scenes.geometry import view_agreement
-from unmix_plugin.scenes.geometry.view_agreement import check_scene_poses, compare_conventions, lens_warning
+from unmix_plugin.scenes.geometry.view_agreement import (
+    compare_conventions,
+    compare_scene_conventions,
+    describe,
+    lens_warning,
+)
 from unmix_plugin.scenes.geometry.views import Views
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.settings import HyperspectralDataManagerConfig
@@ -54,7 +59,7 @@ def rewritten(demo, folder, change=lambda pose: pose, with_alpha=True, shift=0.0
 @pytest.mark.parametrize("with_alpha", [True, False])
 def test_right_poses_raise_no_alarm_far_from_the_origin(demo, tmp_path, with_alpha):
     scene = load_scene(rewritten(demo, tmp_path / "scene", with_alpha=with_alpha, shift=1000.0))
-    assert check_scene_poses(scene) is None
+    assert describe(compare_scene_conventions(scene)) is None
 
 
 TURN = [[0, 0, 1, 0.5], [1, 0, 0, -2], [0, 1, 0, 0.25]]
@@ -68,7 +73,7 @@ def test_conventions_are_told_in_scenes_turned_and_geo_referenced(demo, tmp_path
     path = folder / "transforms.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | ({} if with_alpha else APPLIED)))
     try:
-        said = check_scene_poses(load_scene(folder))
+        said = describe(compare_scene_conventions(load_scene(folder)))
     except SceneError as error:
         said = str(error)
     assert said is None if wrong is None else f"the poses look like {wrong}" in str(said)
@@ -84,7 +89,7 @@ def test_the_remedy_of_the_warning_mends_the_poses(demo, tmp_path):
     (warning,) = [said for said in warnings_of(as_colmap) if "the poses look like" in said]
     assert "invert each, then multiply it from the right by diag(1, -1, -1, 1)" in warning
     mended = rewritten(as_colmap, tmp_path / "mended", lambda pose: np.linalg.inv(pose) @ FLIP)
-    assert check_scene_poses(load_scene(mended)) is None
+    assert describe(compare_scene_conventions(load_scene(mended))) is None
 
 
 def test_views_that_show_nothing_give_no_verdict(demo):

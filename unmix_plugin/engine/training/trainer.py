@@ -10,6 +10,7 @@ import torch
 from rich.console import Console
 
 from unmix_plugin.engine.configs import TrainerConfig, refuse_changes_at_start
+from unmix_plugin.engine.decisions import decision_table
 from unmix_plugin.engine.machine import keep_freed_memory
 from unmix_plugin.engine.processes import ALONE, Processes
 from unmix_plugin.engine.registry import discover_methods
@@ -101,7 +102,7 @@ class Trainer:
         how = "started" if resumed is None else "resumed"
         together = f", {processes.count} processes" if processes.count > 1 else ""
         self._log(f"{how} on {self.pipeline.model.device}, torch {torch.__version__}{together}")
-        for line in self.pipeline.reasons.splitlines():
+        for line in (*self.pipeline.reasons.splitlines(), *decision_table(self.pipeline.decisions)):
             self._log(line)
 
     @property

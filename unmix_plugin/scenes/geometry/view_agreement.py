@@ -100,14 +100,27 @@ def training_views(scene: Scene, with_lines: bool = True) -> Views:
     )
 
 
-def check_scene_poses(scene: Scene) -> str | None:
-    """A warning if the training views agree much better under another convention than the one expected."""
+def compare_scene_conventions(scene: Scene) -> dict[str, float]:
+    """How little the training views agree under each convention of poses; see `compare_conventions`."""
     views = training_views(scene, with_lines=False)  # of which no single pose tells what they saw
     poses = views.cameras.camera_to_world.double().numpy()
     placement = scene.placement  # conventions are those of the matrices in transforms.json
     rotations = placement.rotation @ scene.normalisation.rotation.T @ poses[:, :, :3]
     positions = placement.to_scene(scene.normalisation.to_world(poses[:, :, 3]))
-    return describe(compare_conventions(np.concatenate([rotations, positions[:, :, None]], axis=-1), views))
+    return compare_conventions(np.concatenate([rotations, positions[:, :, None]], axis=-1), views)
+
+
+def convention_decision(disagreements: dict[str, float]) -> Decision:
+    """What the matrices are taken for, against what they could be; undecided where views share too little to tell."""
+    best = min(disagreements, key=lambda name: disagreements[name], default=_GIVEN)
+    is_clear = bool(disagreements) and disagreements[best] <= _MOST_DISAGREEMENT
+    fits = disagreements.get(_GIVEN, 0.0) < _LEAST_RATIO * disagreements.get(best, 0.0)
+    return Decision(
+        "poses",
+        UNDECIDED if not is_clear else "fit" if fits or best == _GIVEN else f"look like {best}",
+        {f"views differ as {name}": value for name, value in disagreements.items()},
+        f"the views differ {_LEAST_RATIO:g} times less under another convention, and clearly",
+    )
 
 
 def compare_conventions(poses: _Poses, views: Views) -> dict[str, float]:
