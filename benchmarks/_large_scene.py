@@ -2,7 +2,7 @@
 
 Rays are cast for each fourth pixel and each stands for a block of them: cheap, and as large to read and to train on as
 any other scene. One shows the built-in table through a wide lens, so that most of each picture is black and its files
-are holes there. The other shows the built-in room with noise and without alpha, so that every value lies on the disk.
+are holes there. The others show the built-in places without alpha, so that every value lies on the disk.
 
 Notation: `B` bands, `H`, `W` rows and columns.
 """
@@ -65,30 +65,41 @@ def write_large_scene(folder: Path, size: int, bands: int, views: int) -> int:
     return sum(512 * path.stat().st_blocks for path in folder.rglob("*") if path.is_file())
 
 
-def write_dense_scene(folder: Path, size: int, bands: int, views: int) -> int:
-    """Write a room without alpha as integers of 16 bits into a new folder; arguments and result as above."""
+DENSE_KINDS = ("room", "world", "backdrop", "rig")
+
+
+def write_dense_scene(folder: Path, size: int, bands: int, views: int, kind: str = "room") -> int:
+    """Write a scene without alpha as integers of 16 bits into a new folder; arguments and result as above.
+
+    Args:
+        kind: A room, the open world, a table before a black backdrop and without noise, of which more pixels are unlike
+            the others than some pixels tell, or the room by two sensors in turn, of which one lacks every other band.
+    """
     (folder / "cubes").mkdir(parents=True)
-    nm, place = band_centers_nm(bands), PLACES["room"]
+    nm, place = band_centers_nm(bands), PLACES[{"backdrop": "table", "rig": "room"}.get(kind, kind)]
     spectra, lamp = reflectances(nm), lamp_power(nm)
     cameras, coarse = place.cameras(size, views), place.cameras(size // BLOCK, views)
     generator, frames = np.random.default_rng(0), []
-    noise = generator.normal(scale=NOISE * _WHITE, size=(BLOCK, size, bands)).astype(np.float32)
+    strength = 0.0 if kind == "backdrop" else NOISE * _WHITE
+    noise = generator.normal(scale=strength, size=(BLOCK, size, bands)).astype(np.float32)
     for index in range(views):
         view, name = (
             render_view(coarse, index, subpixels=1, things=place.things, sky=place.sky),
             frame_name(index),
         )
+        chosen = list(range(0, bands, 2 if kind == "rig" and index % 2 else 1))
         cube = np.lib.format.open_memmap(
-            folder / f"cubes/{name}.npy", mode="w+", dtype=np.uint16, shape=(size, size, bands)
+            folder / f"cubes/{name}.npy", mode="w+", dtype=np.uint16, shape=(size, size, len(chosen))
         )
         for row, values in enumerate(_WHITE * radiance_cube(view, spectra, lamp)):
             shift = int(generator.integers(size))
             noisy = values.repeat(BLOCK, axis=0) + np.roll(noise, shift, axis=1)
-            cube[BLOCK * row : BLOCK * (row + 1)] = noisy.clip(0, _LARGEST_UINT16)
+            cube[BLOCK * row : BLOCK * (row + 1)] = noisy.clip(0, _LARGEST_UINT16)[..., chosen]
         frames.append(
             {
                 "hyperspectral_file_path": f"cubes/{name}.npy",
                 "transform_matrix": transform_matrix(cameras, index),
+                **({"sensor": f"{len(chosen)} bands", "bands": chosen} if kind == "rig" else {}),
             }
         )
     content = {**lens_entries(cameras), "wavelengths": nm.tolist(), "value_scale": _WHITE, "frames": frames}

@@ -89,8 +89,8 @@ def test_pixels_are_held_unless_they_need_more_than_the_budget(folder, monkeypat
     needed = 5 * 320 * (4 * 2 + 5)
     monkeypatch.setattr(pixel_table, "available_bytes", lambda _: 2 * needed)
     assert PixelTable(scene, CPU, scene.train_indices).notes == []
-    assert PixelTable(scene, CPU, scene.train_indices, memory_gb=(needed + 1) / 2**30).notes == []
-    [note] = PixelTable(scene, CPU, scene.train_indices, memory_gb=(needed - 1) / 2**30).notes
+    assert PixelTable(scene, CPU, scene.train_indices, memory_gb=(needed + 2) / 0.85 / 2**30).notes == []
+    [note] = PixelTable(scene, CPU, scene.train_indices, memory_gb=(needed - 2) / 0.85 / 2**30).notes
     assert "5 views x 16 x 20 pixels x 4 bands x 2 bytes are 1.94e-05 GiB" in note
     monkeypatch.setattr(pixel_table, "available_bytes", lambda _: needed)
     assert PixelTable(scene, CPU, scene.train_indices).notes != []

@@ -97,3 +97,39 @@ def test_a_given_number_is_taken_and_its_residual_said_or_that_it_does_not_make_
     assert ignored.startswith("target-components 2 has no effect: ")
     [automatic] = PixelTable(scene, CPU, VIEWS, memory_gb=1e-6, components="auto").notes
     assert "no effect" not in automatic
+
+
+def test_how_many_pixels_stay_whole_is_judged_by_components_as_they_are_stored():
+    pixels = (
+        torch.rand(4000, 3, generator=torch.Generator().manual_seed(0)) @ torch.from_numpy(SMOOTH).float()
+    )
+    pixels[1::4] = pixels[2::4] = pixels[3::4] = 0  # before a black backdrop, to which noise is compared
+    pixels = (
+        pixels[torch.randperm(4000, generator=torch.Generator().manual_seed(1))] * 10_000
+    ).round() / 60_000  # half precision has fewer digits
+    projection = Projection(pixels, 3)
+    held = ProjectedPixels(projection, 4000, CPU, most_bytes=1 << 30)
+    assert held.put(0, pixels)
+    kept = (held.num_bytes - 4000 * 2 * 3) / (2 * BANDS + 8) / 4000
+    assert projection.whole_share > 0.1
+    assert projection.whole_share == pytest.approx(kept, abs=0.03)
+
+
+def test_pixels_stay_on_disk_where_more_must_be_kept_whole_than_some_pixels_told(tmp_path, monkeypatch):
+    scene, judged = make(tmp_path / "scene"), pixel_table.Projection
+
+    def misled(pixels: torch.Tensor, _: int | None) -> Projection:
+        """By pixels that are all alike."""
+        found = judged(pixels * 0 + pixels.mean(dim=0), 1)
+        found.residual, found.whole_share = 0.0, 0.0
+        return found
+
+    monkeypatch.setattr(pixel_table, "Projection", misled)
+    needed = len(VIEWS) * 320 * (5 + 2)
+    for spare, expected in ((0.5 * WHOLE, "kept as 1 numbers"), (3 * BANDS, "stay on disk")):
+        available = int((needed + spare) / 0.8)
+        monkeypatch.setattr(pixel_table, "available_bytes", lambda _, available=available: available)
+        table = PixelTable(scene, CPU, VIEWS, components="auto")
+        assert expected in table.notes[0]
+    [drawn] = table.draw(50, torch.Generator().manual_seed(1), 7)
+    assert torch.equal(drawn.spectra, table.blocks[0].spectra(drawn.numbers))

@@ -6,6 +6,7 @@ Randomness is a function of (seed, step), so that a resumed run draws what a str
 from __future__ import annotations
 
 import ctypes
+import gc
 import random
 import signal
 import sys
@@ -41,7 +42,7 @@ _KEPT_BYTES = 2**30
 
 
 def keep_freed_memory() -> None:
-    """Let the C library keep large freed blocks instead of handing them back to the system.
+    """Hand back to the system what is free now, and let the C library keep large blocks that are freed from now on.
 
     A training step frees and takes blocks of a few MB hundreds of times; by default glibc returns each, and the page
     faults of taking it again took 40 % of the time of a field evaluation on two cores. Does nothing where the C library
@@ -50,9 +51,12 @@ def keep_freed_memory() -> None:
     if not sys.platform.startswith("linux"):
         return
     try:
-        mallopt = ctypes.CDLL("libc.so.6").mallopt
+        library = ctypes.CDLL("libc.so.6")
+        mallopt, trim = library.mallopt, library.malloc_trim
     except (OSError, AttributeError):
         return
+    gc.collect()  # what a search left behind in circles is as large as a scene's grids
+    trim(0)
     mallopt(_MMAP_THRESHOLD, _KEPT_BYTES)
     mallopt(_TRIM_THRESHOLD, _KEPT_BYTES)
 

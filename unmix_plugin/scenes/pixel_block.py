@@ -126,17 +126,24 @@ class PixelBlock:
 
     def hold_part(self, num_bytes: int) -> None:
         """Leave the values on disk, and hold so much of them for draws."""
+        self._values = self._projected = None
+        self.num_bad = 0
         if self.valid.any():
             self.pool = PixelPool(self.valid, self.pixel_bytes, num_bytes, self._read_range)
 
-    def hold_projected(self, projection: Projection, limits: Float[Tensor, " b"] | None) -> None:
-        """Read all values, mended with limits, and hold of each pixel its components in a subspace."""
-        projected = ProjectedPixels(projection, len(self), self.alpha.device)
+    def hold_projected(
+        self, projection: Projection, limits: Float[Tensor, " b"] | None, most_bytes: int | None
+    ) -> bool:
+        """Read all values, mended with limits, and hold of each pixel its components in a subspace. False, and nothing
+        is held: they need more memory than `most_bytes`, which some pixels did not tell."""
+        projected = ProjectedPixels(projection, len(self), self.alpha.device, most_bytes)
         for first in range(0, len(self), self._size):
             for top, image, places, values in self._looked_through(first, limits):
                 image[places] = values
-                projected.put(first + top * self._width, image.flatten(0, 1))
+                if not projected.put(first + top * self._width, image.flatten(0, 1)):
+                    return False
         self._projected = projected
+        return True
 
     def mend(self, limits: Float[Tensor, " b"]) -> None:
         """Replace stripes and spikes by what is around them, of values held in memory; limits as of

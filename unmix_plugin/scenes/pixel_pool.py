@@ -8,7 +8,7 @@ that come next.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 
 import torch
@@ -72,16 +72,21 @@ class PixelPool:
         wanted = range(first, first + self._num_held)
         if sorted(self._held) == list(wanted):
             return
-        ahead = range(first, wanted.stop + _CHUNKS_AHEAD)
-        for position in ahead:
-            if position not in self._held and position not in self._arriving:
-                self._arriving[position] = self._reader.submit(self._read, *self._range(position))
-        for position in wanted:
-            if position not in self._held:
-                self._put(position, self._arriving.pop(position).result())
-        for position in [position for position in self._arriving if position not in ahead]:
+        for position in [position for position in self._arriving if position < first]:
             self._arriving.pop(position).cancel()
+        missing = [position for position in wanted if position not in self._held]
+        coming = [*missing, *range(wanted.stop, wanted.stop + _CHUNKS_AHEAD)]
+        for index, position in enumerate(missing):
+            self._ask_for(coming[index : index + 1 + _CHUNKS_AHEAD])  # all at once would be in memory twice
+            self._put(position, self._arriving.pop(position).result())
+        self._ask_for(coming[len(missing) :])
         self._drawable = (self._numbers >= 0).nonzero()[:, 0]
+
+    def _ask_for(self, positions: Sequence[int]) -> None:
+        """Have the chunks at these positions of the order read."""
+        for position in positions:
+            if position not in self._arriving:
+                self._arriving[position] = self._reader.submit(self._read, *self._range(position))
 
     def _put(self, position: int, values: Tensor) -> None:
         """A chunk in its slot."""

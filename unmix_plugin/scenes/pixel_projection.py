@@ -25,7 +25,7 @@ _LARGEST_RESIDUAL = 2.0
 _UNSATURATED = 0.9999
 """Largest value of a pixel that isn't kept whole: 1 stands for a saturated one."""
 _WHOLE_RESERVE = 1.2
-"""Room for pixels that are kept whole, in multiples of what some pixels let expect."""
+"""Room on a GPU for pixels that are kept whole, in multiples of what some pixels let expect."""
 
 
 class Projection:
@@ -36,7 +36,8 @@ class Projection:
         are needed. Raises SpectrumError: too few pixels, or too many components."""
         self.subspace = find_subspace(pixels[1::2], num_components)
         seen = pixels[::2]
-        residuals = self.subspace.residuals(seen, self.subspace.components(seen))
+        stored = self.subspace.components(seen).half()
+        residuals = self.subspace.residuals(seen, stored.float())
         is_whole = _must_stay_whole(seen, residuals)
         kept = residuals[~is_whole]
         self.residual = float(kept.square().mean().sqrt()) if len(kept) else float("inf")
@@ -70,12 +71,24 @@ class Projection:
 class ProjectedPixels:
     """Spectra of a block's pixels by the components that they have in a subspace."""
 
-    def __init__(self, projection: Projection, num_pixels: int, device: torch.device) -> None:
+    def __init__(
+        self, projection: Projection, num_pixels: int, device: torch.device, most_bytes: int | None = None
+    ) -> None:
+        """
+        Args:
+            num_pixels: Of the block.
+            most_bytes: Memory that the values may take; None for what makes a projection pay.
+        """
         self._subspace = projection.subspace.to(device)
         halves = torch.empty(0, dtype=torch.float16, device=device)
         self._components = halves.new_empty(num_pixels, len(self._subspace))
-        num_whole = int(_WHOLE_RESERVE * projection.whole_share * num_pixels)
-        self._room = halves.new_empty(num_whole, projection.num_channels)
+        row_bytes = 2 * projection.num_channels + 8
+        if most_bytes is None:
+            most_bytes = int(_LARGEST_SHARE * num_pixels * 2 * projection.num_channels)
+        num_rows = max(0, most_bytes - num_pixels * 2 * len(self._subspace)) // row_bytes
+        if device.type != "cpu":
+            num_rows = min(num_rows, int(_WHOLE_RESERVE * projection.whole_share * num_pixels) + 1)
+        self._room = halves.new_empty(min(num_rows, num_pixels), projection.num_channels)
         """For spectra kept whole. The first rows are in use; what isn't takes no memory on a CPU."""
         self._whole = torch.zeros(0, dtype=torch.int64, device=device)
 
@@ -85,19 +98,20 @@ class ProjectedPixels:
         held = (self._components, self._whole, self._room[: len(self._whole)])
         return sum(values.numel() * values.element_size() for values in held)
 
-    def put(self, first: int, spectra: Spectra) -> None:
-        """Keep pixels that follow each other, the first of which has the number `first`; later ones later."""
+    def put(self, first: int, spectra: Spectra) -> bool:
+        """Keep pixels that follow each other, the first of which has the number `first`; later ones later. False: more
+        must be kept whole than there is room for."""
         spectra = spectra.to(self._components.device)
         components = self._subspace.components(spectra).half()
         self._components[first : first + len(spectra)] = components
         residuals = self._subspace.residuals(spectra, components.float())
         whole = _must_stay_whole(spectra, residuals).nonzero()[:, 0]
-        before, self._whole = len(self._whole), torch.cat([self._whole, first + whole])
-        if len(self._whole) > len(self._room):
-            room = self._room.new_empty(len(self._whole) * 5 // 4, self._room.shape[1])
-            room[:before] = self._room[:before]
-            self._room = room
+        before = len(self._whole)
+        if before + len(whole) > len(self._room):
+            return False
+        self._whole = torch.cat([self._whole, first + whole])
         self._room[before : len(self._whole)] = spectra[whole].half()
+        return True
 
     def spectra(self, pixels: Pixels) -> Spectra:
         """Spectra of some pixels in [0, 1]."""

@@ -32,8 +32,8 @@ from unmix_plugin.spectral.bad_values import FEWEST_BANDS, deviation_limits, dev
 from unmix_plugin.spectral.evidence import OPAQUE_ALPHA
 
 _GIB = 2**30
-_USABLE_SHARE = 0.8
-"""Of the memory that is left."""
+_USABLE_SHARE, _GIVEN_SHARE = 0.8, 0.85
+"""Of the memory that is left, and of the memory that was given: reading and drawing pixels takes some, too."""
 _LARGEST_POOL = 2**30
 """Of pixels on disk; more in memory would not be drawn from more evenly."""
 _PIXELS_TO_JUDGE_BY = 20_000
@@ -64,7 +64,7 @@ def available_bytes(device: torch.device) -> int | None:
 def _budget_bytes(device: torch.device, memory_gb: float | None) -> int | None:
     """Memory that pixels may take, by default most of what the device has left; None where nothing limits it."""
     if memory_gb is not None:
-        return int(memory_gb * _GIB)
+        return int(_GIVEN_SHARE * memory_gb * _GIB)
     available = available_bytes(device)
     if available is not None and device.type == "cpu":
         available //= processes_here()
@@ -120,23 +120,35 @@ class PixelTable:
         for block in self.blocks:
             if block.sensor in found:
                 needed += int(len(block) * (5 + found[block.sensor].pixel_bytes)) - block.num_bytes
-        if budget is not None and needed > budget:
-            held = min(_LARGEST_POOL, budget) if is_automatic else budget
-            for block in self.blocks:
-                block.hold_part(held * block.num_bytes // total)
-            return self._pool_notes(total, needed, components)
+        spare = None if budget is None else budget - needed
+        if (spare is None or spare >= 0) and self._hold(found, spare):
+            return [projection.describe() for projection in found.values()]
+        budget = needed if budget is None else budget
+        held = min(_LARGEST_POOL, budget) if is_automatic else budget
+        for block in self.blocks:
+            block.hold_part(held * block.num_bytes // total)
+        return self._pool_notes(total, max(needed, budget), components)
+
+    def _hold(self, found: Mapping[int, Projection], spare: int | None) -> bool:
+        """Read all pixels, those of some sensors as components, into so many bytes more than is expected; None for any
+        number. False: they would take more, and what is held is of no use."""
         for block in self.blocks:
             limits = self._limits(block)
-            if block.sensor in found:
-                block.hold_projected(found[block.sensor], limits)
+            if block.sensor not in found:
+                block.hold()
+                if limits is not None:
+                    block.mend(limits)
                 continue
-            block.hold()
-            if limits is not None:
-                block.mend(limits)
-        return [projection.describe() for projection in found.values()]
+            expected = int(len(block) * found[block.sensor].pixel_bytes)
+            if not block.hold_projected(
+                found[block.sensor], limits, None if spare is None else expected + spare
+            ):
+                return False
+            spare = None if spare is None else spare - max(0, block.held_bytes - expected)
+        return True
 
     def _pool_notes(self, total: int, needed: int, components: Components) -> list[str]:
-        """What stays on disk, in words, and that components which need so many bytes don't help."""
+        """What stays on disk, in words, and that components don't help, which need at least so many bytes."""
         held = sum(block.pool.num_bytes for block in self.blocks if block.pool is not None)
         what = " and ".join(block.description for block in self.blocks)
         said = (
@@ -146,8 +158,9 @@ class PixelTable:
         if isinstance(components, str):
             return [said]
         no_effect = (
-            f"target-components {components} has no effect: even as so many numbers each the training pixels need "
-            f"{needed / _GIB:.3g} GiB, and pixels on disk keep all bands; choose fewer, or more memory (memory-gb)"
+            f"target-components {components} has no effect: even as so many numbers each the training pixels need at "
+            f"least {needed / _GIB:.3g} GiB, and pixels on disk keep all bands; choose fewer, or more memory "
+            "(memory-gb)"
         )
         return [said, no_effect]
 

@@ -4,7 +4,10 @@
 only if the tensors' SHA-256 is the record's. The tensors are those of parameters, optimiser and average.
 """
 
+import errno
 import hashlib
+import os
+import shutil
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass
@@ -21,7 +24,7 @@ from unmix_plugin.engine.runs.atomic_files import (
     OtherFormatError,
     adopt_run_json,
     read_run_json,
-    write_file,
+    whole_file,
     write_run_json,
 )
 from unmix_plugin.engine.runs.config_json import config_from_json
@@ -39,6 +42,8 @@ from unmix_plugin.limits import read_bounded
 
 _MOST_BYTES = 1 << 33
 """Of a checkpoint's tensors; the largest grids that settings allow take some gigabytes with the optimiser's state."""
+_JUDGED_TOGETHER = 1 << 20
+"""Numbers of a tensor: to ask all of a large one at once takes its memory several times."""
 _MODEL, _OPTIMIZER, AVERAGE = "model/", "optimizer/", "average/"
 
 
@@ -69,17 +74,18 @@ def save_checkpoint(
             are as they were.
     """
     require_sound(tensors)
-    data = safetensors.torch.save(_separate(tensors))
     tensors_path, record_path = folder / f"{_stem(step)}.safetensors", folder / f"{_stem(step)}.json"
-    sha256 = hashlib.sha256(data).hexdigest()
     try:
         folder.mkdir(parents=True, exist_ok=True)
         remove_stale_temporaries(folder)
         _remove_orphans(folder)
+        separate = _separate(tensors)
         is_there = record_path.exists() and tensors_path.exists()
-        if not is_there or hashlib.sha256(tensors_path.read_bytes()).hexdigest() != sha256:
+        if not is_there or tensors_path.read_bytes() != safetensors.torch.save(separate):
             _remove(record_path, tensors_path)  # of a damaged one: never a record beside other tensors
-            write_file(tensors_path, data)
+            with whole_file(tensors_path) as temporary:
+                _write_tensors(temporary, separate)
+        sha256 = hash_of(tensors_path)
         write_run_json(record_path, {**record, "step": step, "sha256": sha256})
         _remove_others(folder, step, keep)
     except OSError as error:
@@ -88,6 +94,18 @@ def save_checkpoint(
         _remove_orphans(folder)
         raise
     return record_path
+
+
+def _write_tensors(path: Path, tensors: dict[str, Tensor]) -> None:
+    """Write a file of tensors from where they lie in memory. Raises OSError: the disk is full or refuses."""
+    num_bytes = sum(tensor.numel() * tensor.element_size() for tensor in tensors.values())
+    try:
+        safetensors.torch.save_file(tensors, path)
+    except SafetensorError as error:
+        written = path.stat().st_size if path.exists() else 0
+        if shutil.disk_usage(path.parent).free < num_bytes - written:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)) from error
+        raise OSError(errno.EIO, str(error)) from error
 
 
 def newest_complete_checkpoint(folder: Path) -> Checkpoint:
@@ -136,9 +154,12 @@ def require_sound(tensors: Mapping[str, Tensor]) -> None:
 def _is_sound(name: str, tensor: Tensor) -> bool:
     """Whether a tensor holds numbers; what a model keeps beside its parameters may be infinite."""
     is_small = tensor.is_floating_point() and tensor.element_size() == 1  # of which torch can't ask it
-    values = tensor.float() if is_small else tensor
-    is_sound = values.isnan().logical_not() if name.startswith(_MODEL) else values.isfinite()
-    return bool(is_sound.all())
+    for values in tensor.detach().reshape(-1).split(_JUDGED_TOGETHER):
+        values = values.float() if is_small else values
+        is_sound = values.isnan().logical_not() if name.startswith(_MODEL) else values.isfinite()
+        if not is_sound.all():
+            return False
+    return True
 
 
 def _stem(step: int) -> str:

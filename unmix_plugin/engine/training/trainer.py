@@ -79,7 +79,6 @@ class Trainer:
         self.console = console or ProgressConsole()
         self.control = control or TrainingControl()
         self.processes = processes
-        keep_freed_memory()
         with processes.together():
             resumed = None if config.load_run is None else open_run_folder(config.load_run)
             if resumed is not None:
@@ -133,6 +132,7 @@ class Trainer:
                 an older one.
             RunError: the disk is full, or loss and gradients stay non-finite.
         """
+        keep_freed_memory()  # not while the scene is read, whose largest arrays are gone before training begins
         try:
             with self.control.device.training_turn():
                 self.warm_up()
