@@ -101,8 +101,9 @@ class HyperspectralDataManagerConfig(DataManagerConfig):
     """Replace stripes and spikes in training views by what is around them: values that stand out from the bands
     beside them and from the pixels around them in that. From 8 bands on, for pixels that memory holds."""
     memory_gb: float | Auto = "auto"
-    """GiB of memory for training pixels and for reading them. Auto is most of what the device has left. Pixels that need more stay in the
-    scene's files, and a part of them is held that is renewed while training goes on."""
+    """GiB of memory for training pixels and for reading them. Auto is most of what the device has left.
+    Pixels that need more stay in the scene's files, and a part of them is held that is renewed while training goes
+    on."""
 
     target_components: int | Literal["auto", "none"] = "auto"
     """Numbers to keep of each training pixel instead of one a band: its components in the subspace that the scene's
