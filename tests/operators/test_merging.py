@@ -12,7 +12,7 @@ STEP = 0.1
 
 
 def make(counts: list[int], depth: float = 0.5):
-    """Depths, distances with gaps, features, which samples are whose, and light that is left."""
+    """Depths, distances with gaps, features, which samples are whose, and light that is transmittance."""
     g = torch.Generator().manual_seed(0)
     total = sum(counts)
     depths = depth * torch.rand(total, generator=g).square()
@@ -24,13 +24,13 @@ def make(counts: list[int], depth: float = 0.5):
 @pytest.mark.parametrize(("smallest", "most"), [(0.0, 0.0), (0.01, 0.2), (0.05, 0.1), (0.0, 2.0)])
 def test_kernel_and_twin_agree(counts, smallest, most, device):
     inputs, limits = make(counts), MergeLimits(STEP, smallest, most)
-    depths, t, features, packed_info, left = (value.to(device) for value in inputs)
-    found = merge_samples(depths, t, features, packed_info, left, limits)
-    depths, t, features, packed_info, left = inputs
-    expected = merge_samples_twin(depths, t, features, packed_info, left, limits)
+    depths, t, features, packed_info, transmittance = (value.to(device) for value in inputs)
+    found = merge_samples(depths, t, features, packed_info, transmittance, limits)
+    depths, t, features, packed_info, transmittance = inputs
+    expected = merge_samples_twin(depths, t, features, packed_info, transmittance, limits)
     for name in ("ray_indices", "packed_info"):
         assert torch.equal(getattr(found, name).cpu(), getattr(expected, name))
-    for name in ("weights", "t", "features", "left"):
+    for name in ("weights", "t", "features", "transmittance"):
         assert_close(getattr(found, name).cpu(), getattr(expected, name), rtol=1e-4, atol=1e-5)
 
 
@@ -41,13 +41,13 @@ def test_unmerged_samples_have_the_weights_of_volume_rendering():
     assert_close(found.weights, weights[weights > 0])
     assert_close(found.features, features[weights > 0])
     ones = torch.ones(len(found.t), 1)
-    assert_close(accumulate(found.weights, ones, found.packed_info)[:, 0], 1 - found.left)
+    assert_close(accumulate(found.weights, ones, found.packed_info)[:, 0], 1 - found.transmittance)
 
 
 def test_merging_keeps_weighted_sums_and_keeps_to_its_limits():
-    depths, t, features, packed_info, left = make([20, 5, 0, 400], depth=0.1)
+    depths, t, features, packed_info, transmittance = make([20, 5, 0, 400], depth=0.1)
     alone, merged = (
-        merge_samples(depths, t, features, packed_info, left, MergeLimits(STEP, 0.0, most))
+        merge_samples(depths, t, features, packed_info, transmittance, MergeLimits(STEP, 0.0, most))
         for most in (0.0, 0.1)
     )
     assert len(merged.t) < 0.6 * len(alone.t)
@@ -57,7 +57,7 @@ def test_merging_keeps_weighted_sums_and_keeps_to_its_limits():
         for x in (alone, merged)
     ]
     assert_close(sums[0], sums[1], rtol=1e-4, atol=1e-5)
-    assert_close(alone.left, merged.left)
+    assert_close(alone.transmittance, merged.transmittance)
 
 
 def test_samples_before_and_behind_empty_space_stay_apart():

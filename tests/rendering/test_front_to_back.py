@@ -50,7 +50,7 @@ def test_what_is_left_out_costs_no_more_than_in_the_careful_way(monkeypatch, sma
     assert (errors[0] < errors[1] + 2 * smallest).all()
 
 
-def test_a_ray_ends_where_hardly_any_light_is_left_and_counts_as_opaque(monkeypatch):
+def test_a_ray_ends_where_no_sample_can_count_any_more(monkeypatch):
     renderer, field = textured(4e-3, 0.9)
     looked_at = []
     encode = type(field).encode
@@ -64,7 +64,20 @@ def test_a_ray_ends_where_hardly_any_light_is_left_and_counts_as_opaque(monkeypa
         field.table.zero_()
     found = renderer.composite(field, rays(50))
     assert sum(looked_at) == 50 * front_to_back.FEWEST_SAMPLES
-    assert_close(found.accumulation, torch.ones(50))
+    assert_close(found.accumulation, torch.full((50,), 1 - 0.1**3))
+
+
+@pytest.mark.parametrize("at_once", [front_to_back.FEWEST_SAMPLES, front_to_back.SAMPLES_MARCHED])
+@pytest.mark.parametrize("opacity", [0.002, 0.02, 0.1, 0.4, 0.9])
+def test_no_ray_is_more_opaque_than_it_is_however_little_light_is_left(monkeypatch, opacity, at_once):
+    """To take what lets little through for opaque would be a step in the pictures."""
+    monkeypatch.setattr("unmix_plugin.rendering.front_to_back.FEWEST_SAMPLES", at_once)
+    renderer, field = textured(4e-3, opacity)
+    bundle = rays(200)
+    with torch.no_grad():
+        exact = replace(renderer, smallest_weight=0.0).render(field, bundle).coefficients.accumulation
+    found = renderer.composite(field, bundle).accumulation
+    assert (found <= exact + 1e-5).all()
 
 
 @pytest.mark.parametrize("residual", [False, True])
@@ -111,6 +124,6 @@ def test_pictures_of_a_trained_scene_are_those_of_the_careful_renderer(tmp_path)
         errors = (model.materials.spectra(found) - model.materials.spectra(exact)).abs()
     assert float(exact.accumulation.max()) > 0.8
     assert 0 < float(errors.square().mean().sqrt()) < 1e-3
-    # Rays end where so much of their light is left, which takes the colour of what lies before.
+    # Rays end where no sample can count any more, and samples that carry less are left out.
     assert float(errors.max()) < 3 * smallest
     assert float((found.accumulation - exact.accumulation).abs().max()) < 3 * smallest

@@ -36,8 +36,8 @@ class MergedSamples:
     ray_indices: Int[Tensor, "G"]
     packed_info: Int[Tensor, "R 2"]
     """First group and number of groups of each ray."""
-    left: Float[Tensor, "R"]
-    """Share of its light that each ray still has behind its samples."""
+    transmittance: Float[Tensor, "R"]
+    """Of each ray, behind its samples."""
 
 
 @dataclass(frozen=True)
@@ -57,12 +57,12 @@ def merge_samples(
     t: Float[Tensor, "S"],
     features: Float[Tensor, "S F"],
     packed_info: Int[Tensor, "R 2"],
-    left: Float[Tensor, "R"],
+    transmittance: Float[Tensor, "R"],
     limits: MergeLimits,
 ) -> MergedSamples:
-    """Merge the samples of each ray from the front, where `left` is the share of its light that it has before them;
+    """Merge the samples of each ray from the front, given its `transmittance` before them;
     without gradients."""
-    num_rays, behind = len(packed_info), left.clone()
+    num_rays, behind = len(packed_info), transmittance.clone()
     weights, places = torch.empty_like(t), torch.empty_like(t)
     means = torch.empty_like(features, memory_format=torch.contiguous_format)
     counts = torch.empty(num_rays, dtype=torch.int64, device=t.device)
@@ -79,12 +79,12 @@ def merge_samples_twin(
     t: Float[Tensor, "S"],
     features: Float[Tensor, "S F"],
     packed_info: Int[Tensor, "R 2"],
-    left: Float[Tensor, "R"],
+    transmittance: Float[Tensor, "R"],
     limits: MergeLimits,
 ) -> MergedSamples:
     """The same as `merge_samples` in plain Python, sample by sample."""
     groups: list[tuple[int, list[int]]] = []
-    weights, behind, counts = torch.zeros_like(t), left.clone(), []
+    weights, behind, counts = torch.zeros_like(t), transmittance.clone(), []
     for ray, (start, count) in enumerate(packed_info.tolist()):
         before = len(groups)
         for sample in range(start, start + count):
@@ -125,7 +125,7 @@ def _merge_kernel(
     smallest: float,
     most: float,
     gap: float,
-    left: wp.array(dtype=float),
+    transmittances: wp.array(dtype=float),
     counts: wp.array(dtype=wp.int64),
     group_weights: wp.array(dtype=float),
     group_t: wp.array(dtype=float),
@@ -138,7 +138,7 @@ def _merge_kernel(
         sample = start
         stop = start + int(packed_info[ray, 1])
         group = start - 1
-        transmittance = left[ray]
+        transmittance = transmittances[ray]
         total = float(0.0)  # noqa: UP018 - Warp takes a bare literal for a constant
         last = float(0.0)  # noqa: UP018
         while sample < stop:
@@ -168,6 +168,6 @@ def _merge_kernel(
                 group_weights[group] = total
                 last = t
             sample += 1
-        left[ray] = transmittance
+        transmittances[ray] = transmittance
         counts[ray] = wp.int64(group + 1 - start)
         ray += stride

@@ -1,12 +1,12 @@
-"""What rays sum to, without gradients: looked at from the front until hardly any light is left.
+"""What rays sum to, without gradients: samples are evaluated from the front until no more light gets through.
 
-For pictures of a trained field. `VolumeRenderer.render` is the careful way, which training takes: it evaluates every
-sample that carries weight, and goes on farther. Here neighbouring samples are merged where together they carry little
-of their ray's light, and what lies behind the place where a ray ends is taken to look like what lies before it.
+For pictures of a trained field. `VolumeRenderer.render` is what training takes: it first evaluates the density of every
+sample. Both end a ray where its transmittance is no more than the smallest weight of a sample, behind which no sample
+can count; so opacities are the same. Here neighbouring samples are merged where together they carry little light.
 
-So many rays are under way at once as keep the processor busy: those that end make room for others.
+As many rays are active at once as keep the processor busy: those that end make room for others.
 
-Notation: `R` rays, `A` of them that are under way, `M` samples of each that are marched at once, `C` coefficients.
+Notation: `R` rays, `A` active ones, `M` samples of each that are marched at once, `C` coefficients.
 """
 
 from __future__ import annotations
@@ -29,88 +29,94 @@ from unmix_plugin.spectral.materials import Coefficients
 if TYPE_CHECKING:
     from unmix_plugin.rendering.renderer import VolumeRenderer
 
-_ENDING_LIGHT = 3.0
-"""Share of its light at which a ray ends, in multiples of the smallest weight of a sample."""
 _MERGED_WEIGHT = 125.0
-"""Most of a ray's light that merged samples carry together, in the same unit."""
+"""Most of a ray's light that merged samples carry together, in multiples of the smallest weight of a sample."""
 FEWEST_SAMPLES = 4
-"""Of each ray, that are looked at before it is known whether light gets farther; later at most as many as so far, since
+"""Of each ray, that are evaluated before it is known whether light gets farther; later at most as many as so far, since
 light that gets through those gets through more."""
 SAMPLES_MARCHED = 16
 """Of each ray, before it is known whether light gets behind them."""
 _DENSER = 2.0
-"""How many times denser what follows is taken to be than what was looked at: most rays have just entered a surface."""
+"""How many times denser what follows is taken to be than what was evaluated: most rays have just entered a surface."""
 
 
 @dataclass(frozen=True)
-class _Front:
-    """How far rays under way were looked at."""
+class _ActiveRays:
+    """Rays that go on, and their samples up to some distance."""
 
     rays: Int[Tensor, "A"]
-    left: Float[Tensor, "A"]
-    """Share of its light that each still has."""
+    transmittance: Float[Tensor, "A"]
+    """Of all that was evaluated."""
     wanted: Int[Tensor, "A"]
-    """Samples of each to look at next, if it has as many."""
-    num_seen: Int[Tensor, "A"]
-    """Samples of each that were looked at."""
-    ends: Float[Tensor, "A"]
-    """From where to march on."""
+    """Samples of each to evaluate next, if it has as many."""
+    num_evaluated: Int[Tensor, "A"]
     t: Float[Tensor, "A M"]
-    """The samples that were marched."""
-    counts: Int[Tensor, "A"]
-    """How many there are."""
-    at: Int[Tensor, "A"]
-    """The next of them."""
+    """Distances of the samples that were marched last."""
+    count: Int[Tensor, "A"]
+    """How many these are."""
+    next: Int[Tensor, "A"]
+    """Which of them is evaluated next."""
+    t_end: Float[Tensor, "A"]
+    """From where to march on."""
 
-    @classmethod
-    def before(cls, rays: Int[Tensor, "A"], like: Float[Tensor, "_ _"]) -> _Front:
-        """Rays before they are marched."""
-        none, numbers = torch.zeros_like(rays), like.new_zeros(len(rays))
+    @staticmethod
+    def at_camera(rays: Int[Tensor, "A"], like: Float[Tensor, "_ _"]) -> _ActiveRays:
+        """Rays of which nothing was marched yet."""
+        zeros, numbers = torch.zeros_like(rays), like.new_zeros(len(rays))
         t = like.new_zeros(len(rays), SAMPLES_MARCHED)
-        return cls(rays, numbers + 1, none + _samples_at_once(like), none, numbers, t, none, none)
+        wanted = zeros + _samples_at_once(like)
+        return _ActiveRays(rays, numbers + 1, wanted, zeros, t, zeros, zeros, numbers)
 
     def __len__(self) -> int:
         return len(self.rays)
 
-    def select(self, chosen: Int[Tensor, "N"]) -> _Front:
+    def select(self, chosen: Int[Tensor, "N"]) -> _ActiveRays:
         """Some of the rays."""
-        return _Front(*(getattr(self, each.name).index_select(0, chosen) for each in fields(self)))
+        return _ActiveRays(*(getattr(self, each.name).index_select(0, chosen) for each in fields(self)))
 
-    def join(self, more: _Front) -> _Front:
+    def join(self, more: _ActiveRays) -> _ActiveRays:
         """With other rays."""
         pairs = ((getattr(self, each.name), getattr(more, each.name)) for each in fields(self))
-        return _Front(*map(torch.cat, pairs))
+        return _ActiveRays(*map(torch.cat, pairs))
 
-    def marched(self, ray_bundle: RayBundle, renderer: VolumeRenderer) -> _Front:
-        """With the next samples of each ray that has some."""
-        lines = _lines(ray_bundle, self.rays)
-        found = renderer.march(*lines, self.ends).first_samples(SAMPLES_MARCHED)
-        marched = replace(self, t=found.t, counts=found.counts, ends=found.ends, at=torch.zeros_like(self.at))
-        return marched.select(found.counts.nonzero()[:, 0])
+    def march(self, ray_bundle: RayBundle, renderer: VolumeRenderer) -> _ActiveRays:
+        """With further samples of the rays whose samples are evaluated; without rays that have none."""
+        is_used_up = self.next == self.count
+        rows = is_used_up.nonzero()[:, 0]
+        lines = _lines(ray_bundle, self.rays.index_select(0, rows))
+        found = renderer.march(*lines, self.t_end.index_select(0, rows)).first_samples(SAMPLES_MARCHED)
+        marched = replace(
+            self,
+            t=self.t.index_copy(0, rows, found.t),
+            count=self.count.index_copy(0, rows, found.counts),
+            next=self.next.masked_fill(is_used_up, 0),
+            t_end=self.t_end.index_copy(0, rows, found.ends),
+        )
+        return marched.select(marched.count.nonzero()[:, 0])
 
     def next_counts(self) -> Int[Tensor, "A"]:
-        """How many samples of each are looked at next."""
-        return torch.minimum(self.wanted, self.counts - self.at)
+        """How many samples of each are evaluated next."""
+        return torch.minimum(self.wanted, self.count - self.next)
 
-    def after(self, left: Float[Tensor, "A"], ending_light: float) -> tuple[_Front, _Front]:
-        """Behind these samples: rays with enough light of which there are more, and those to be marched on."""
-        looked = self.next_counts()
-        at, num_seen = self.at + looked, self.num_seen + looked
-        enough = looked / _DENSER * (left / ending_light).log() / (self.left / left).log()
+    def behind(self, transmittance: Float[Tensor, "A"], smallest: float) -> _ActiveRays:
+        """Behind these samples, the rays that have light left and may meet more."""
+        evaluated = self.next_counts()
+        position, num_evaluated = self.next + evaluated, self.num_evaluated + evaluated
+        enough = evaluated / _DENSER * (transmittance / smallest).log()
+        enough /= (self.transmittance / transmittance).log()
         enough = enough.ceil().nan_to_num(nan=torch.inf)  # no number if both logarithms are infinite
-        at_first = _samples_at_once(left)
+        at_first = _samples_at_once(transmittance)
         fewest = 1 if at_first < SAMPLES_MARCHED else SAMPLES_MARCHED
-        wanted = torch.minimum(enough, num_seen.clamp(min=at_first)).clamp(min=fewest).long()
-        front = replace(self, left=left, wanted=wanted, num_seen=num_seen, at=at)
-        is_lit, has_more = left > ending_light, at < self.counts
-        may_have_more = ~has_more & (self.counts == SAMPLES_MARCHED)
-        chosen = ((is_lit & which).nonzero()[:, 0] for which in (has_more, may_have_more))
-        going, waiting = (front.select(rays) for rays in chosen)
-        return going, waiting
+        wanted = torch.minimum(enough, num_evaluated.clamp(min=at_first)).clamp(min=fewest).long()
+        passed = replace(
+            self, transmittance=transmittance, wanted=wanted, num_evaluated=num_evaluated, next=position
+        )
+        may_have_more = (position < self.count) | (self.count == SAMPLES_MARCHED)
+        return passed.select(((transmittance > smallest) & may_have_more).nonzero()[:, 0])
 
 
 def _samples_at_once(like: Tensor) -> int:
-    """Samples of each ray to look at together at first; on a GPU always as many as are marched, since it computes more
+    """Samples of each ray to evaluate together at first; on a GPU always as many as are marched, since it computes more
     of them in less time than the processor takes to ask again."""
     return FEWEST_SAMPLES if like.device.type == "cpu" else SAMPLES_MARCHED
 
@@ -121,62 +127,54 @@ def composite_front_to_back(
 ) -> Coefficients:
     """Coefficients (R, ...) of each ray of a field, before any sky."""
     origins, smallest = ray_bundle.origins, renderer.smallest_weight
-    ending_light = _ENDING_LIGHT * smallest
     limits = MergeLimits(renderer.step, smallest, _MERGED_WEIGHT * smallest)
-    left = torch.ones_like(origins[:, 0])
-    all_rays = torch.arange(len(left), device=left.device)
-    going = waiting = _Front.before(all_rays[:0], origins)
-    num_begun, totals, last = 0, None, None
-    while True:
-        room = max(renderer.rays_per_chunk - len(going) - len(waiting), 0)
-        begun = _Front.before(all_rays[num_begun : num_begun + room], origins)
-        num_begun += len(begun)
-        marched = waiting.join(begun).marched(ray_bundle, renderer)
-        front = going.join(marched)
-        merged = _look(field, ray_bundle, front, limits)
-        values = _values(renderer, field, ray_bundle, front.rays, merged)
-        if totals is None or last is None:
-            totals = values.packed.new_zeros(len(left), values.packed.shape[1])
-            last = torch.zeros_like(totals) if renderer.residual_on_last_sample else totals[:0]
-        totals.index_add_(0, front.rays, accumulate(merged.weights, values.packed, merged.packed_info))
-        if renderer.residual_on_last_sample:
-            found = merged.packed_info[:, 1].nonzero()[:, 0]
-            last[front.rays[found]] = values.packed[merged.packed_info[found].sum(dim=1) - 1]
-        left[front.rays] = merged.left
-        going, waiting = front.after(merged.left, ending_light)
-        if num_begun == len(left) and len(going) == len(waiting) == 0:
-            break
-    if renderer.residual_on_last_sample:
+    pending = torch.arange(len(origins), device=origins.device)
+    active = _ActiveRays.at_camera(pending[:0], origins)
+    features = field.density_of(field.encode(origins[:0]))[1]
+    nothing = _coefficients(renderer, field, (origins[:0], origins[:0]), origins[:0, 0], features)
+    totals = nothing.packed.new_zeros(len(origins), nothing.packed.shape[1])
+    last = torch.zeros_like(totals) if renderer.residual_on_last_sample else None
+    while len(pending) or len(active):
+        room = max(renderer.rays_per_chunk - len(active), 0)
+        active = active.join(_ActiveRays.at_camera(pending[:room], origins)).march(ray_bundle, renderer)
+        pending = pending[room:]
+        merged = _evaluate(field, ray_bundle, active, limits)
+        lines = _lines(ray_bundle, active.rays.index_select(0, merged.ray_indices))
+        values = _coefficients(renderer, field, lines, merged.t, merged.features).packed
+        totals.index_add_(0, active.rays, accumulate(merged.weights, values, merged.packed_info))
+        if last is not None:
+            rows = merged.packed_info[:, 1].nonzero()[:, 0]
+            last[active.rays[rows]] = values[merged.packed_info[rows].sum(dim=1) - 1]
+        active = active.behind(merged.transmittance, smallest)
+    if last is not None:
         totals = totals + (1 - totals[:, :1]) * last
-    else:
-        totals *= torch.where(left > ending_light, 1.0, 1 / (1 - left))[:, None]
-    return Coefficients(totals, values.num_endmembers)
+    return Coefficients(totals, nothing.num_endmembers)
 
 
-def _look(
-    field: CoefficientField, ray_bundle: RayBundle, front: _Front, limits: MergeLimits
+def _evaluate(
+    field: CoefficientField, ray_bundle: RayBundle, active: _ActiveRays, limits: MergeLimits
 ) -> MergedSamples:
     """The next samples of rays, merged."""
-    firsts = torch.arange(len(front), device=front.at.device) * SAMPLES_MARCHED + front.at
-    owners, rows, info = packed_rows(firsts, front.next_counts())
-    t = front.t.view(-1).index_select(0, rows)
-    origins, along = _lines(ray_bundle, front.rays.index_select(0, owners))
+    firsts = torch.arange(len(active), device=active.next.device) * SAMPLES_MARCHED + active.next
+    owners, rows, info = packed_rows(firsts, active.next_counts())
+    t = active.t.view(-1).index_select(0, rows)
+    origins, along = _lines(ray_bundle, active.rays.index_select(0, owners))
     densities, features = field.density_of(field.encode(torch.addcmul(origins, along, t[:, None])))
-    return merge_samples(densities * limits.step, t, features, info, front.left, limits)
+    return merge_samples(densities * limits.step, t, features, info, active.transmittance, limits)
 
 
-def _values(
+def _coefficients(
     renderer: VolumeRenderer,
     field: CoefficientField,
-    ray_bundle: RayBundle,
-    rays: Int[Tensor, "A"],
-    merged: MergedSamples,
+    lines: tuple[Float[Tensor, "S 3"], Float[Tensor, "S 3"]],
+    t: Float[Tensor, "S"],
+    features: Float[Tensor, "S G"],
 ) -> Coefficients:
-    """What groups of samples look like."""
-    origins, along = _lines(ray_bundle, rays.index_select(0, merged.ray_indices))
-    positions = torch.addcmul(origins, along, merged.t[:, None])
+    """What opaque samples on these lines look like."""
+    origins, along = lines
+    positions = torch.addcmul(origins, along, t[:, None])
     light = renderer.lamplight(field, origins, positions)
-    return coefficients_of(merged.t, field.get_outputs(positions, along, merged.features, light))
+    return coefficients_of(t, field.get_outputs(positions, along, features, light))
 
 
 def coefficients_of(t: Float[Tensor, "S"], outputs: Mapping[str, Tensor]) -> Coefficients:
