@@ -2,6 +2,7 @@
 
 import configparser
 import json
+import os
 import re
 import subprocess
 import sys
@@ -147,3 +148,26 @@ def test_help_of_every_command_is_printed_without_a_heavy_package():
     assert ends[:-1] == [["end:", name, "0"] for name in COMMANDS[:-1]]
     assert ends[-1][:3] == ["end:", "export", "0"]
     assert set(ends[-1][3:]) <= {"torch", "warp"}
+
+
+def in_a_new_process(code, **environment):
+    """What Python code prints, started without what these tests set."""
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("OMP_")}
+    command = [sys.executable, "-W", "always", "-c", code]
+    return subprocess.run(command, capture_output=True, text=True, check=True, env={**kept, **environment})
+
+
+def test_torch_loads_with_threads_that_sleep_while_they_wait_from_python_too():
+    """Threads that spin make everything many times slower as soon as anything else runs on the machine."""
+    code = "import os, sys, unmix_plugin as u; print('torch' in sys.modules, os.environ['OMP_WAIT_POLICY'])"
+    found = in_a_new_process(f"{code}; u.open_run; print('torch' in sys.modules)")
+    assert found.stdout.split() == ["False", "PASSIVE", "True"]
+    assert "OMP_WAIT_POLICY" not in found.stderr
+    assert in_a_new_process(code, OMP_WAIT_POLICY="ACTIVE").stdout.split() == ["False", "ACTIVE"]
+
+
+def test_who_imports_torch_first_is_told_what_that_costs():
+    code = "import torch; torch.set_num_threads({}); import unmix_plugin"
+    assert "RuntimeWarning: torch was imported before unmix_plugin" in in_a_new_process(code.format(2)).stderr
+    assert in_a_new_process(code.format(1)).stderr == ""
+    assert in_a_new_process(code.format(2), OMP_WAIT_POLICY="ACTIVE").stderr == ""

@@ -4,6 +4,9 @@ The public names, for scripts and notebooks; docs/guides/python.md shows each. T
 so that `import unmix_plugin` costs nothing.
 """
 
+import os
+import sys
+import warnings
 from importlib import import_module
 from typing import TYPE_CHECKING
 
@@ -20,6 +23,22 @@ if TYPE_CHECKING:
     from unmix_plugin.trained.outputs import MaterialView as MaterialView
     from unmix_plugin.trained.protocol import Probe as Probe
     from unmix_plugin.trained.trained_scene import TrainedScene as TrainedScene
+
+# Threads that wait for each other by spinning take the time slices of those they wait for as soon as anything else
+# runs on the machine: on two shared cores a training step took three times as long. Read once, when torch loads OpenMP.
+if (
+    "torch" in sys.modules
+    and "OMP_WAIT_POLICY" not in os.environ
+    and sys.modules["torch"].get_num_threads() > 1
+):
+    warnings.warn(
+        "torch was imported before unmix_plugin, so its threads spin while they wait: where anything else runs on the "
+        "machine, everything takes many times as long. Import unmix_plugin first, or set OMP_WAIT_POLICY=PASSIVE "
+        "before Python starts (ACTIVE keeps it as it is, without this warning)",
+        RuntimeWarning,
+        stacklevel=2,
+    )
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 __version__ = "0.1.0"
 
