@@ -88,11 +88,39 @@ def test_missing_parts_of_an_envi_library_are_named(tmp_path):
     path.with_suffix(".sli").unlink()
     with pytest.raises(SpectrumError, match=r"no file of numbers beside this header; expected trees\.sli"):
         read_library(path)
-    with pytest.raises(SpectrumError, match=r"none\.hdr: can't read"):
+    with pytest.raises(SpectrumError, match=r"no header beside it; expected none\.hdr or none\.sli\.hdr"):
         read_library(tmp_path / "none.sli")
     path.write_text("something else")
     with pytest.raises(SpectrumError, match="its first line is not 'ENVI'"):
         read_library(path)
+
+
+@pytest.mark.parametrize("header", ["trees.sli.hdr", "trees.HDR"])
+def test_the_header_of_a_library_is_found_as_that_of_a_cube_is(tmp_path, header):
+    path, spectra = written_by_spectral(tmp_path)
+    path.rename(tmp_path / header)
+    for named in (tmp_path / header, path.with_suffix(".sli")):
+        found = np.array([one.reflectance for one in read_library(named)])
+        np.testing.assert_allclose(found, spectra, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "stated", ["y units = Reflectance (percent)", "z plot titles = {Wavelength, Reflectance (%)}"]
+)
+def test_a_library_in_percent_by_its_header_is_divided_by_100(tmp_path, stated):
+    path, spectra = written_by_spectral(tmp_path)
+    plain = path.read_text()
+    path.write_text(f"{plain}\n{stated}\n")
+    np.testing.assert_allclose([one.reflectance for one in read_library(path)], spectra / 100, rtol=1e-6)
+    path.write_text(f"{plain}\n{stated}\nreflectance scale factor = 10000\n")
+    np.testing.assert_allclose([one.reflectance for one in read_library(path)], spectra / 10_000, rtol=1e-6)
+
+
+def test_names_with_commas_stand_in_quotes_and_no_unit_is_nm(tmp_path):
+    path, _ = written_by_spectral(tmp_path, spectra_names='{"oak, dry", birch}', wavelength_units="Unknown")
+    assert [one.name for one in read_library(path)] == ["oak, dry", "birch"]
+    with pytest.raises(SpectrumError, match="3 'spectra names' for 2 spectra; names with commas need quotes"):
+        read_library(written_by_spectral(tmp_path, spectra_names="{oak, dry, birch}")[0])
 
 
 def test_a_table_may_be_in_micrometres_percent_and_any_order_with_marks_for_what_is_missing(tmp_path):

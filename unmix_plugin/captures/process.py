@@ -167,7 +167,7 @@ def _wanted_views(capture: Capture, options: ProcessOptions) -> tuple[list[Captu
     wanted = _without(capture.views, options.leave_out)
     for view in wanted:
         with unreadable.noted(view.name):
-            for row in {0, view.cube.shape[0] // 2, view.cube.shape[0] - 1}:
+            for row in sorted({0, view.cube.shape[0] // 2, view.cube.shape[0] - 1}):
                 view.cube.read(slice(row, row + 1))
     left_out |= _said_of_unreadable(unreadable.found)
     left_out |= {name: Remark.of(Code.VIEW_NOT_WANTED, [name]) for name in options.leave_out}

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float64
 
 from unmix_plugin.captures.names import common_length
 from unmix_plugin.errors import ConfigError, SpectrumError
-from unmix_plugin.limits import read_bounded
+from unmix_plugin.limits import MOST_ITEMS, allow_parts, read_bounded
 from unmix_plugin.spectral.bands import nm_per_unit, require_nanometres
 
 _DIGITS = r"\d+(?:[.,]\d+)?"
@@ -203,7 +203,9 @@ def in_ranges(text: str, wavelengths_nm: Float64[np.ndarray, " B"]) -> Bool[np.n
 
 def _read_words(path: Path) -> list[str]:
     try:
-        with io.TextIOWrapper(io.BytesIO(read_bounded(path)), "utf-8-sig", newline="") as file:
+        data = read_bounded(path)
+        allow_parts(path, max(data.count(b"\n"), data.count(b",")), "numbers", ConfigError, MOST_ITEMS)
+        with io.TextIOWrapper(io.BytesIO(data), "utf-8-sig", newline="") as file:
             rows = [[cell.strip() for cell in row] for row in csv.reader(file) if any(map(str.strip, row))]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         reason = getattr(error, "strerror", None) or error

@@ -9,6 +9,7 @@ Notation: `H` lines, `W` samples and `C` bands of an image; `K` spectra of `B` b
 
 from __future__ import annotations
 
+import csv
 import glob
 import math
 import re
@@ -175,7 +176,12 @@ def _closing_brace(body: str, start: int, key: str, is_repeated: bool) -> int:
 
 def header_items(header: Mapping[str, str], key: str, separator: str = r"[,\s]") -> list[str]:
     """Elements of a list; commas too many at its ends or in a row count as none."""
-    items = [" ".join(item.split()) for item in re.split(separator, header.get(key, ""))]
+    text = header.get(key, "")
+    if separator == "," and '"' in text:  # names with commas in them
+        parts = next(csv.reader([" ".join(text.split())], skipinitialspace=True))
+    else:
+        parts = re.split(separator, text)
+    items = [" ".join(item.split()) for item in parts]
     return [item for item in items if item]
 
 
@@ -240,6 +246,15 @@ def _count(header: Mapping[str, str], key: str, default: str = "", least: int = 
     if not (least <= number < _LARGEST and number == int(number)):
         raise ValueError(f"'{key}' is {text or 'missing'}; expected a whole number of at least {least}")
     return int(number)
+
+
+def header_beside(data_path: Path) -> Path | None:
+    """The ENVI header of a file of numbers: x.hdr or x.raw.hdr for x.raw."""
+    for candidate in (data_path.with_name(data_path.name + ".hdr"), data_path.with_suffix(".hdr")):
+        for path in (candidate, candidate.with_suffix(".HDR")):
+            if path.is_file() and path != data_path:
+                return path
+    return None
 
 
 def data_beside(header_path: Path, needed_bytes: int, first: str = "") -> Path:

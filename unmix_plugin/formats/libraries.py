@@ -22,8 +22,8 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 from unmix_plugin.errors import SpectrumError, name_some
-from unmix_plugin.formats.envi import data_beside, header_items, read_header, read_layout
-from unmix_plugin.limits import read_bounded
+from unmix_plugin.formats.envi import data_beside, header_beside, header_items, read_header, read_layout
+from unmix_plugin.limits import MOST_BANDS, allow_parts, read_bounded
 from unmix_plugin.spectral.bands import Bands, are_band_numbers, nm_per_unit, require_nanometres
 from unmix_plugin.spectral.library.material_library import (
     LibraryMaterial,
@@ -106,8 +106,8 @@ def _libraries_in(folder: Path) -> list[Path]:
     kinds = [f".{suffix}" for suffix in LIBRARY_SUFFIXES if suffix != "hdr"]  # each .sli has its own
     there = sorted(folder.iterdir())
     found = [path for path in there if path.suffix.lower() in kinds and not _BESIDE_SPECTRA.search(path.name)]
-    with_numbers = {path.stem for path in found if path.suffix.lower() == ".sli"}
-    headers = [path for path in there if path.suffix.lower() == ".hdr" and path.stem not in with_numbers]
+    with_numbers = {header_beside(path) for path in found if path.suffix.lower() == ".sli"}
+    headers = [path for path in there if path.suffix.lower() == ".hdr" and path not in with_numbers]
     found += filter(_is_library, headers)
     if not found:
         raise SpectrumError(f"{folder}: no library in this folder ({', '.join(kinds)})")
@@ -196,6 +196,7 @@ def _read_csv(path: Path) -> _Table:
     return names, values[:, 0] * factor, values[:, 1:].T, scales
 
 
+_PERCENT_UNIT = re.compile(r"percent|per cent|%", re.IGNORECASE)
 _KEYS = ("reflectance scale", "data ignore", "data gain", "data offset", "bbl", "wavelength", "spectra names")
 """Of a header of spectra, beside those of its layout."""
 
@@ -210,11 +211,15 @@ def _header_of_spectra(path: Path) -> dict[str, str]:
 
 def _read_envi(path: Path) -> _Table:
     """Of the header these keys count beside those of the layout: `wavelength` and `wavelength units`, `spectra names`,
-    `reflectance scale factor` (values are divided by it), `data ignore value`, and `bbl`, whose bad bands are gaps."""
-    header_path = path if path.suffix.lower() == ".hdr" else path.with_suffix(".hdr")
+    `reflectance scale factor` (values are divided by it), `data ignore value`, and `bbl`, whose bad bands are gaps.
+    Percent in `y units` or `z plot titles` is divided by 100, where no factor says otherwise."""
+    header_path = path if path.suffix.lower() == ".hdr" else header_beside(path)
+    if header_path is None:
+        raise ValueError(f"no header beside it; expected {path.stem}.hdr or {path.name}.hdr")
     header = _header_of_spectra(header_path)
     layout = read_layout({**header, "file type": "", "bands": "1", "interleave": "bsq"})
     num_spectra, num_bands, _ = layout.shape
+    allow_parts(header_path, num_bands, "bands", SpectrumError, MOST_BANDS)
     data_path = data_beside(header_path, layout.num_bytes, ".sli")
     found = data_path.stat().st_size
     if found != layout.num_bytes:  # more is a header that is wrong, too
@@ -235,13 +240,16 @@ def _read_envi(path: Path) -> _Table:
         raise ValueError(f"'bbl' has {len(good)} marks for {num_bands} bands")
     values[:, np.array(good) == 0] = np.nan
     unit = header.get("wavelength units", "").strip()
-    factor = nm_per_unit(unit or "nm")
+    factor = nm_per_unit("nm" if unit.lower() in ("", "unknown") else unit)
     if factor is None:
         raise ValueError(f"'wavelength units' is {unit!r}; expected Nanometers or Micrometers")
     names = header_items(header, "spectra names", ",") or [f"spectrum {i}" for i in range(num_spectra)]
     if len(names) != num_spectra:
-        raise ValueError(f"{len(names)} 'spectra names' for {num_spectra} spectra")
-    scale = _number(header, "reflectance scale factor", "1")
+        raise ValueError(
+            f"{len(names)} 'spectra names' for {num_spectra} spectra; names with commas need quotes: \"grass, dry\""
+        )
+    is_percent = any(_PERCENT_UNIT.search(header.get(key, "")) for key in ("y units", "z plot titles"))
+    scale = _number(header, "reflectance scale factor", "100" if is_percent else "1")
     if not _SMALLEST_SCALE <= scale <= 1.0 / _SMALLEST_SCALE:
         raise ValueError(f"'reflectance scale factor' is {scale:g}; expected a number above 0, such as 10000")
     return names, _wavelengths(header, num_bands) * factor, values, scale
@@ -316,6 +324,7 @@ def _words_and_numbers(path: Path) -> tuple[list[str], list[list[float]]]:
     A comma is the decimal mark between digits of a line whose numbers something else parts: `400<tab>0,25`.
     """
     text = read_bounded(path).decode("utf-8-sig", "replace")
+    allow_parts(path, text.count("\n"), "lines", SpectrumError, MOST_BANDS)
     words: list[str] = []
     numbers: list[list[float]] = []
     for line in filter(str.strip, text.splitlines()):

@@ -165,6 +165,10 @@ SAID: list[tuple[dict[str, Any], dict[str, Any]]] = [
     (gdal(SCALE.replace("</Item>", "", 1)), {"linear": None, "warning": "GDAL's metadata in the file is d"}),
     # A gain that is applied is not of the camera, too.
     (gdal(gdal_items("gain", [4] * 6), TIME), {"calibrated": CUBE * 4.0, "exposure_s": 0.01, "gain": None}),
+    (  # of a band without its own, nobody knows it
+        gdal(gdal_items("scale", [0.5] * 3, ' role="scale"')),
+        {"warning": "'scale' is stated of 3 of 6 bands: that of the others is taken for 1"},
+    ),
     (gdal(GAIN, TRIPLED, TINT), {"calibrated": CUBE * 3.0, "exposure_s": 0.01, "gain": 4.0}),
 ]
 

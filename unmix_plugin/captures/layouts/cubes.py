@@ -23,11 +23,12 @@ from dataclasses import replace
 from pathlib import Path
 
 from unmix_plugin.captures.names import natural_order, view_names
-from unmix_plugin.captures.readers.envi import described_image, header_beside
+from unmix_plugin.captures.readers.envi import described_image
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import Capture, CaptureView, ReadOptions, SpectralFile
 from unmix_plugin.captures.spoilt import UnreadableViews
 from unmix_plugin.errors import CaptureError, name_some
+from unmix_plugin.formats.envi import header_beside
 from unmix_plugin.formats.files import safe_name
 
 _CUBE_SUFFIXES = frozenset(

@@ -162,6 +162,11 @@ def _exposure_of_bands(parts: Sequence[SpectralFile], warnings: list[str]) -> di
     parts have the same."""
     exposed = [[part.metadata.get(key, usual) for key, usual in _EXPOSURE.items()] for part in parts]
     lacking = [part.path.name for part in parts if "f_number" not in part.metadata]
+    without = [part.path.name for part in parts if "gain" not in part.metadata]
+    if 0 < len(without) < len(parts) and any(time is not None for time, *_ in exposed):
+        unknown = f"the gain is known of some bands and not of {name_some(without)}"
+        warnings.append(f"{unknown}: exposures are not compared; write it into all files, or none")
+        return {}
     is_exposed = any(time is not None for time, *_ in exposed)
     is_partial = is_exposed and 0 < len(lacking) < len(parts)
     if is_partial:

@@ -15,6 +15,7 @@ from unmix_plugin.formats.envi import (
     EnviLayout,
     data_beside,
     header_begins,
+    header_beside,
     image_size,
     read_header,
     read_layout,
@@ -48,15 +49,6 @@ def is_envi_header(path: Path) -> bool:
     """Whether a file of any name begins as a header does."""
     with path.open("rb") as file:
         return header_begins(file.read(32))
-
-
-def header_beside(data_path: Path) -> Path | None:
-    """The ENVI header of a file of numbers: x.hdr or x.raw.hdr for x.raw."""
-    for candidate in (data_path.with_name(data_path.name + ".hdr"), data_path.with_suffix(".hdr")):
-        for path in (candidate, candidate.with_suffix(".HDR")):
-            if path.is_file() and path != data_path:
-                return path
-    return None
 
 
 def open_envi(path: Path, _: ReadOptions) -> SpectralFile:

@@ -74,6 +74,12 @@ def gdal_linear(
     for name, key in plain_names(items).items():
         if name in (*_GAINS, *_OFFSETS) and set(items[key]) != {None}:
             usual = items[key].get(None, "1" if name in _GAINS else "0")
+            lacking = num_bands - len(items[key].keys() - {None})
+            if lacking > 0 and None not in items[key]:
+                warnings.append(
+                    f"{where} '{key}' is stated of {num_bands - lacking} of {num_bands} bands: that of the others is "
+                    f"taken for {usual}, and their values may be off by a factor"
+                )
             entries[key] = [items[key].get(band, usual) for band in range(num_bands)]
     return state_linear(path, num_bands, entries, where, [(_GAINS, _OFFSETS)], warnings)
 

@@ -19,7 +19,6 @@ from unmix_plugin.captures.readers.containers import KINDS, open_container, open
 from unmix_plugin.captures.readers.envi import (
     described_by_header,
     described_image,
-    header_beside,
     is_envi_header,
     open_envi,
 )
@@ -35,6 +34,7 @@ from unmix_plugin.captures.spectral_file import (
     with_mask,
 )
 from unmix_plugin.errors import CaptureError
+from unmix_plugin.formats.envi import header_beside
 from unmix_plugin.limits import open_regular, open_zip
 
 _BEGINNINGS = {

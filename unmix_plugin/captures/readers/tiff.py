@@ -432,7 +432,7 @@ def _described(page: TiffPage) -> dict[str, Any]:
     units = [match["unit"], match["before"], beside[1] if beside else None, found[0][1]]
     known = [unit for unit in units if unit and nm_per_unit(unit)]
     of_items = {unit.lower() for _, unit in found if unit}
-    if len({nm_per_unit(unit) for unit in (*known, *of_items)}) > 1:
+    if len({nm_per_unit(unit) for unit in [*known, *sorted(of_items)]}) > 1:
         said = ", ".join(dict.fromkeys(unit for unit in (*known, *sorted(of_items))))
         raise CaptureError(
             f"{page.parent.filename}: the description gives wavelengths in several units ({said}); correct it, or give "

@@ -236,7 +236,7 @@ def move_files(built: Path, folder: Path, last: str) -> None:
         OSError.
     """
     files = sorted(path.relative_to(built) for path in _files_below(built))
-    folders = {folder / file.parent for file in files}
+    folders = sorted({folder / file.parent for file in files})
     refuse_foreign([*(folder / file for file in files), *(one for one in folders if _is_odd(one, folder))])
     for one in sorted({folder, *folders}):
         one.mkdir(exist_ok=True)

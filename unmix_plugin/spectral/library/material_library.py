@@ -151,7 +151,9 @@ class MaterialLibrary:
         greatest, where = (own, "") if own > _GREATEST_REFLECTANCE else (beside, " in its file")
         if greatest > _GREATEST_REFLECTANCE:
             raise SpectrumError(
-                f"{what} must be in reflectances, 1 for white; found {greatest:g}{where} (divide percent by 100)"
+                f"{what} must be in reflectances, 1 for white; found {greatest:g}{where}. If these are percent, say so "
+                "('NAME (%)' in the head of a table, 'y units = Percent' in an ENVI header) or divide percent by 100; "
+                "if they are another quantity, give reflectances"
             )
 
     @cached_property
