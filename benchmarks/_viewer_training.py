@@ -85,7 +85,7 @@ def _seconds(words: list[str], way: str, options: TrainingViewerOptions) -> tupl
         trainer.train()
     else:
         source = source_of_training(trainer, read_scene_record(trainer.run))
-        source.device.guest_share = options.share
+        source.device.viewing_share = options.share
         viewer = Viewer(Services(source, _no_scene), options)
         viewer.start()
         page = None if way == "no page" else _page(viewer.port, moves=way.endswith("moving"))

@@ -144,10 +144,10 @@ def test_a_video_goes_on_when_its_page_is_closed(run_copy):
             page.set("render a video", True)
             page.wait_until(lambda: any(title == "video" for title, _ in page.notices))
         until = time.monotonic() + START_S
-        while not list(folder.rglob("*.mp4")):
+        while viewer.services.videos.is_busy:
             assert time.monotonic() < until, list(folder.rglob("*"))
             time.sleep(0.1)
-        assert not list(folder.rglob(".*"))
+        assert not list(folder.rglob("*.tmp"))
         with looking(f"ws://127.0.0.1:{viewer.port}") as page:
             wait_for_control(page, "render a video")
     finally:

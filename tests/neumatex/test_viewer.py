@@ -9,7 +9,7 @@ from tests.neumatex.surfaces import RECORD, make_object
 from tests.viewer.pages import decoded, has_control, opened, serving, show_layer
 from tests.viewer.view_factory import make_source, no_scene
 from unmix_plugin.engine.runs.run_folder import RunFolder
-from unmix_plugin.engine.training.training_control import DeviceShare
+from unmix_plugin.engine.training.training_control import DeviceLock
 from unmix_plugin.errors import ConfigError, SceneError
 from unmix_plugin.formats.exr import write_exr
 from unmix_plugin.trained.model_scene import LightChoice, ModelView, relit
@@ -23,7 +23,7 @@ from unmix_plugin.viewer.view_cameras import camera_of, sized_camera
 @pytest.fixture
 def source(tmp_path):
     scene = make_object()
-    return SceneSource(RunFolder(tmp_path), RECORD, DeviceShare(), lambda: scene)
+    return SceneSource(RunFolder(tmp_path), RECORD, DeviceLock(), lambda: scene)
 
 
 def finished(page, viewer):
@@ -47,7 +47,7 @@ def finished(page, viewer):
 
 def test_every_output_is_a_layer_and_the_picture_becomes_as_fine_as_a_finished_view(source):
     with serving(source) as (viewer, _), opened(viewer, rows=48) as page:
-        with source.borrowed() as scene:
+        with source.locked() as scene:
             titles = [output.title for output in scene.outputs]
         assert page.controls[page.control("layer")]["options"] == titles
         pictures = [show_layer(page, title) for title in titles[1:]]
@@ -64,7 +64,7 @@ def test_a_users_environment_is_offered_and_lights_the_object(source, tmp_path):
     write_exr(path, colours, {})
     services = Services(source, no_scene, environments=[path])
     assert services.lights[-1] == str(path)
-    with source.borrowed() as scene:
+    with source.locked() as scene:
         red = relit(scene, LightChoice(services.lights[-1]), "neumatex")
     seen = red.render(RECORD.train_cameras[0], ["linear_rgb"])["linear_rgb"]
     assert float(seen[..., 0].max()) > 0.05
@@ -108,7 +108,7 @@ def test_a_click_reads_the_numbers_of_the_light_that_is_shown(source):
         page.click(0.5, 0.5)
         page.wait_until(lambda: "linear_rgb" in page.texts)
         camera = camera_of(session.pose(), _PROBED_ROWS)
-        with source.borrowed() as scene:
+        with source.locked() as scene:
             lit = relit(scene, light, "neumatex").probe(camera, camera.width // 2, camera.height // 2)
             plain = scene.probe(camera, camera.width // 2, camera.height // 2)
         assert _first_numbers(lit.values["linear_rgb"]) in page.texts
@@ -130,7 +130,7 @@ def test_the_strips_of_a_screenshot_have_the_scale_of_the_picture_on_screen(sour
         page.wait_until(lambda: page.downloads == ["view.png"])
         camera, maker = sized_camera(session.pose(), 32, 24), viewer.services.maker
         settings = session.view.settings.changed("value_range", session.value_range_shown)
-        with source.borrowed() as scene:
+        with source.locked() as scene:
             whole = maker.paint(scene.look(camera, session.view.subpixels), settings, False, False).picture
     saved = np.asarray(Image.open(viewer.services.folder / "view.png").convert("RGB"))
     np.testing.assert_allclose(saved, whole, atol=1)

@@ -19,7 +19,7 @@ from unmix_plugin.editing import Light, Recipe, Remove, edit_scene
 from unmix_plugin.engine.processes import ALONE
 from unmix_plugin.engine.runs.load_run import SceneRecord
 from unmix_plugin.engine.runs.run_folder import RunFolder
-from unmix_plugin.engine.training.training_control import DeviceShare
+from unmix_plugin.engine.training.training_control import DeviceLock
 from unmix_plugin.products import spectrum as spectrum_product
 from unmix_plugin.products.product import Job
 from unmix_plugin.products.scene_products import Spectrum
@@ -157,12 +157,12 @@ def test_viewer_export_and_python_say_the_same_of_a_place(scene, trained, measur
     python = spectrum_at(trained, Pixel(camera, 13, 12), measured)
     cameras = [replace(scene.cameras[i]) for i in scene.train_indices]
     record = SceneRecord(BOX, {}, cameras[0], cameras[1], {})
-    turns = DeviceShare()
+    turns = DeviceLock()
     source = SceneSource(RunFolder(tmp_path), record, turns, lambda: trained)
     maker = PictureMaker(source)
     maker.aids.measured = MeasuredViews(scene, source)
-    taken, turn = [], turns.guest_turn
-    turns.guest_turn = lambda cost: taken.append(cost) or turn(cost)  # type: ignore[method-assign]
+    taken, turn = [], turns.viewing_turn
+    turns.viewing_turn = lambda cost: taken.append(cost) or turn(cost)  # type: ignore[method-assign]
     clicked = _take_probe(maker, Edit(), camera, (13.2, 12.9), 1)
     assert len(taken) == 1
     np.testing.assert_array_equal(clicked.measured, python.measured.mean)

@@ -150,3 +150,14 @@ def test_a_colour_bar_says_its_values_and_bars_are_as_long_as_theirs_and_never_l
     red = (1.0, 0.0, 0.0)
     content = page.bars([("a", 0.25, red), ("b", 7.0, red), ("c", -1.0, red)])
     assert all(f"width:{width}" in content for width in ("25.0%", "100.0%", "0.0%"))
+
+
+def test_a_message_that_is_logged_steers_no_terminal(caplog):
+    def gone(_message):
+        raise RuntimeError("the page has gone")
+
+    with page.reporting_failures("that failed\x1b[2J", gone):
+        raise OSError(2, "no such file", "view\x1b]0;x\x07.npy")
+    assert len(caplog.messages) == 2
+    assert "Traceback" in caplog.text
+    assert not any(letter in message for message in caplog.messages for letter in "\x1b\x07")

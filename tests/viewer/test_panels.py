@@ -20,7 +20,7 @@ from unmix_plugin.editing import Light, Recipe, Retint
 from unmix_plugin.engine.registry import Output
 from unmix_plugin.engine.runs.load_run import SceneRecord
 from unmix_plugin.engine.runs.run_folder import RunFolder
-from unmix_plugin.engine.training.training_control import DeviceShare
+from unmix_plugin.engine.training.training_control import DeviceLock
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.figures.plotting import css_colour
 from unmix_plugin.formats.files import eight_bits
@@ -216,7 +216,7 @@ def test_a_region_is_drawn_named_kept_as_commands_read_it_and_removed(tmp_path):
         return region
 
     def area_of(region):
-        with source.borrowed_materials() as scene:
+        with source.locked_materials() as scene:
             return MeasuredSurface.of(scene).measure(region, "").area
 
     with serving(source) as (viewer, _), opened(viewer) as page:
@@ -594,7 +594,7 @@ def test_all_that_another_method_names_is_shown_by_its_kind_as_its_scene_renders
     cameras = ring()
     record = SceneRecord(BOX, {"grid_size": 6}, cameras, cameras[[1, 3]], {})
     scene = ModelScene(model.eval(), world_frame(record), recorded_views(record), OUTPUTS)
-    source = SceneSource(RunFolder(tmp_path), record, DeviceShare(), lambda: scene)
+    source = SceneSource(RunFolder(tmp_path), record, DeviceLock(), lambda: scene)
     with serving(source) as (viewer, _), opened(viewer) as page:
         assert page.props("layer")["options"] == [output.title for output in OUTPUTS]
         assert not has_control(page, "known material")

@@ -31,7 +31,7 @@ def probed(scene, camera, column, row):
 @pytest.fixture
 def taken(source, camera):
     before = torch.get_rng_state()
-    with source.borrowed() as scene:
+    with source.locked() as scene:
         found = probed(scene, camera, camera.width / 2, camera.height / 2)
     assert torch.equal(torch.get_rng_state(), before)
     return found
@@ -39,7 +39,7 @@ def taken(source, camera):
 
 def test_a_probe_is_what_the_picture_shows_there(source, camera, taken):
     row, column = camera.height // 2, camera.width // 2
-    with source.borrowed() as scene:
+    with source.locked() as scene:
         outputs = scene.render(camera, ["spectral", "abundances"])
     np.testing.assert_allclose(taken.predicted, outputs["spectral"][row, column], rtol=1e-5)
     assert taken.found.abundances.sum() == pytest.approx(1)
@@ -63,7 +63,7 @@ def test_a_probe_lies_on_the_ray_through_the_click(camera, taken):
 
 
 def test_what_users_read_of_a_place_is_in_the_world(source, camera, taken):
-    with source.borrowed() as scene:
+    with source.locked() as scene:
         moved = probed(replace(scene, frame=WORLD), camera, camera.width / 2, camera.height / 2)
     np.testing.assert_array_equal(moved.point, taken.point)
     expected = WORLD.to_world(taken.point[None])[0]
@@ -76,7 +76,7 @@ def test_where_nothing_is_there_is_nothing_to_probe(source, camera):
     away = camera.camera_to_world.clone()
     away[0, :, 3] *= 50
     away[0, :, 1:3] *= -1  # looks the other way
-    with source.borrowed() as scene, pytest.raises(ConfigError, match="nothing is there"):
+    with source.locked() as scene, pytest.raises(ConfigError, match="nothing is there"):
         surface_at(scene, replace(camera, camera_to_world=away), (100.0, 100.0))
 
 

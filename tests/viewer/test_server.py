@@ -88,7 +88,7 @@ def test_the_training_panel_steers_the_training(tmp_path):
         page.set("stop training")
         page.wait_for_text("stopping")
         assert control.is_stop_requested
-        assert control.device.guest_share == 0.7
+        assert control.device.viewing_share == 0.7
         page.set("save a checkpoint")
         page.wait_until(lambda: any(title == "saving" for title, _ in page.notices))
         assert control.take_save_request()

@@ -14,7 +14,7 @@ from tests.trained.camera_scenes import cameras_at
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.runs.load_run import SceneRecord
 from unmix_plugin.engine.runs.run_folder import RunFolder
-from unmix_plugin.engine.training.training_control import DeviceShare, TrainingControl
+from unmix_plugin.engine.training.training_control import DeviceLock, TrainingControl
 from unmix_plugin.errors import SceneError
 from unmix_plugin.model import UnmixModel
 from unmix_plugin.scenes.scene import Scene
@@ -23,7 +23,7 @@ from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.rendering.aids import LayerAids, render_reference
 from unmix_plugin.viewer.rendering.painting import LAYERS, Legend, _Picture, layer_named
-from unmix_plugin.viewer.rendering.pictures import PictureMaker, Shown, _Speedometer
+from unmix_plugin.viewer.rendering.pictures import Picture, PictureMaker, _Speedometer
 from unmix_plugin.viewer.rendering.render_loop import RenderLoop, View
 from unmix_plugin.viewer.rendering.scene import SceneSource
 from unmix_plugin.viewer.rendering.settings import LayerSettings
@@ -46,7 +46,7 @@ def source_of_model(model: UnmixModel, folder: Path, control: TrainingControl | 
     """The scenes of a model that a test may change in training turns."""
     cameras = ring()
     record = SceneRecord(BOX, dict(model.metadata), cameras, cameras[[1, 3]], {})
-    device = DeviceShare() if control is None else control.device
+    device = DeviceLock() if control is None else control.device
     return SceneSource(RunFolder(folder), record, device, lambda: unmix_scene(model, record), control)
 
 
@@ -57,14 +57,14 @@ def no_scene() -> Scene:
 
 def make_frame(source: SceneSource, camera: Cameras | None = None) -> MaterialView:
     """A rendered view."""
-    with source.borrowed() as scene:
+    with source.locked() as scene:
         assert isinstance(scene, TrainedScene)
         return scene.look(source.record.train_cameras[0] if camera is None else camera, subpixels=1)
 
 
 def make_aids(source: SceneSource) -> LayerAids:
     """What layers need."""
-    with source.borrowed() as scene:
+    with source.locked() as scene:
         assert isinstance(scene, TrainedScene)
         return LayerAids(*render_reference(scene, source.record.train_cameras), source.record.scene_box)
 
@@ -83,7 +83,7 @@ class Screen:
     """Stands in for a browser: keeps what is shown and what is said."""
 
     def __init__(self) -> None:
-        self.shown: list[Shown] = []
+        self.shown: list[Picture] = []
         self.reports: list[str] = []
         self._changed = threading.Condition()
         self.view = View(show=self._show, report=self._report)
@@ -98,7 +98,7 @@ class Screen:
         with self._changed:
             self._changed.wait(seconds)
 
-    def _show(self, shown: Shown) -> None:
+    def _show(self, shown: Picture) -> None:
         with self._changed:
             self.shown.append(shown)
             self._changed.notify_all()

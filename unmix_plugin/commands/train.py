@@ -195,7 +195,7 @@ def _shown(trainer: Trainer, viewing: TrainingViewerOptions, console: Console) -
         say(console, f"no viewer: {error}")
         yield
         return
-    source.device.guest_share = viewing.share
+    source.device.viewing_share = viewing.share
 
     def scene() -> Scene:
         found = spectral_scene(trainer.pipeline.datamanager)

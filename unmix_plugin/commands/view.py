@@ -76,7 +76,7 @@ def prepared(options: ViewOptions) -> Viewer:
     with working(console, "looking at the scene"):
         scene = partial(_scene_of, source, options.data)
         services = Services(source, scene, recipe, options.viewer.environments, known)
-        return Viewer(services, options.viewer, partial(print))
+        return Viewer(services, options.viewer, tell)
 
 
 def _scene_of(source: SceneSource, data: Path | None) -> Scene:

@@ -209,16 +209,18 @@ def open_server(
     of what pages caused that should not have happened, in a short line each. A ConfigError if viser is of a version
     that can't be guarded."""
     serve, ports = websockets.asyncio.server.serve, iter(range(port, 65536))
+    logger = logging.Logger(LABEL)  # of nobody: requests of strangers are not for the user's log
+    logger.addHandler(logging.NullHandler())
 
     def serve_guarded(handler: Any, *_address: Any, process_request: Any, **options: Any) -> Any:
         asyncio.get_running_loop().set_exception_handler(_fault_handler(say))
         guards = {
             "process_request": partial(_answer, authentication, process_request, title),
-            "process_response": _add_headers,
+            "process_response": lambda _connection, _request, response: _with_headers(response, _HEADERS),
             "create_connection": partial(_Connection, authentication),
             "max_size": _LARGEST_MESSAGE,
             "max_queue": 4,
-            "logger": _silent_logger(),
+            "logger": logger,
         }
         # Asked once more, viser found its port taken meanwhile.
         return serve(handler, host, next(ports), **{**options, **guards})
@@ -235,13 +237,6 @@ def open_server(
                 f"viser {viser.__version__} starts its server in a way that the viewer can't guard; install viser 1.1"
             )
     return server
-
-
-def _silent_logger() -> logging.Logger:
-    """A logger of nobody: requests of strangers are not for the user's log."""
-    logger = logging.Logger(LABEL)
-    logger.addHandler(logging.NullHandler())
-    return logger
 
 
 async def _answer(
@@ -290,10 +285,6 @@ def _with_headers(response: Response, headers: Mapping[str, str]) -> Response:
         response.headers.pop(name, None)
         response.headers[name] = value
     return response
-
-
-def _add_headers(_connection: ServerConnection, _request: Request, response: Response) -> Response:
-    return _with_headers(response, _HEADERS)
 
 
 def _fault_handler(say: Callable[[str], None]) -> Callable[[Any, dict[str, Any]], None]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import traceback
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from jaxtyping import Float
 
+from unmix_plugin.engine.printing import terminal_text
 from unmix_plugin.engine.runs.replacing import claim
 from unmix_plugin.errors import ConfigError, UnmixError
 from unmix_plugin.figures.plotting import css_colour
@@ -83,7 +85,7 @@ def new_file(folder: Path, name: Any, suffix: str, fallback: str) -> Path:
 
 
 @contextmanager
-def failures_said(what: str, say: Callable[[str], None]) -> Iterator[None]:
+def reporting_failures(what: str, say: Callable[[str], None]) -> Iterator[None]:
     """Context that lets no error out: `say` shows its message to the user; internal ones are logged with their
     traceback and reported as `what`, and errors of `say` are logged."""
     try:
@@ -92,12 +94,12 @@ def failures_said(what: str, say: Callable[[str], None]) -> Iterator[None]:
     except UnmixError as error:
         message = str(error)
     except Exception as error:  # noqa: BLE001 - internal errors must not end the thread that serves everyone
-        _LOG.exception(what)
+        _LOG.error("%s", terminal_text(f"{what}\n{traceback.format_exc()}"))
         message = f"{what}: {type(error).__name__}: {error}"
     try:
         say(message)
     except Exception:  # noqa: BLE001 - the page to tell has gone
-        _LOG.warning("%s, and the client could not be told: %s", what, message)
+        _LOG.warning("%s", terminal_text(f"{what}, and the client could not be told: {message}"))
 
 
 class Debounced:

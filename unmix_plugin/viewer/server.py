@@ -18,7 +18,7 @@ from unmix_plugin.trained.run_views import up_direction
 from unmix_plugin.viewer.access import ViewerOptions, free_port, start_notices
 from unmix_plugin.viewer.authentication import Authentication
 from unmix_plugin.viewer.connections import LABEL, open_server, quiet, send_what_is_queued
-from unmix_plugin.viewer.page import failures_said, paragraph
+from unmix_plugin.viewer.page import paragraph, reporting_failures
 from unmix_plugin.viewer.panels import panels_of
 from unmix_plugin.viewer.session import PageState, Services, Session
 from unmix_plugin.viewer.view_cameras import beside, point_ahead, pose_of
@@ -158,7 +158,7 @@ class Viewer:
         def warn(reason: str) -> None:
             client.gui.add_html(paragraph(reason, is_warning=True))
 
-        with failures_said("this page could not be served", warn):
+        with reporting_failures("this page could not be served", warn):
             browser = _browser_of(client)
             session = Session(client, self.services, self._kept_pages.take(browser), browser)
             with self._lock:
@@ -180,7 +180,7 @@ class Viewer:
 
     def _tick(self) -> None:
         while not self._stopped.wait(_TICK_S):
-            with failures_said("panels could not be renewed", self._say):
+            with reporting_failures("panels could not be renewed", self._say):
                 self.services.tick()
                 for session in list(self._sessions.values()):
                     session.tick()

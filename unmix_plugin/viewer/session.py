@@ -25,11 +25,11 @@ from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.model_scene import LightChoice, RelightableScene, relit
 from unmix_plugin.trained.run_views import recorded_views
 from unmix_plugin.trained.trained_scene import TrainedScene
-from unmix_plugin.viewer.page import failures_said, number, paragraph
+from unmix_plugin.viewer.page import number, paragraph, reporting_failures
 from unmix_plugin.viewer.recipes import RecipeHistory, numbered
 from unmix_plugin.viewer.rendering.captures import VideoQueue
 from unmix_plugin.viewer.rendering.painting import legend_html
-from unmix_plugin.viewer.rendering.pictures import DEFAULT_HEIGHT, HEIGHT_BOUNDS, PictureMaker, Shown
+from unmix_plugin.viewer.rendering.pictures import DEFAULT_HEIGHT, HEIGHT_BOUNDS, Picture, PictureMaker
 from unmix_plugin.viewer.rendering.regions import RunRegions
 from unmix_plugin.viewer.rendering.render_loop import RenderLoop, View
 from unmix_plugin.viewer.rendering.scene import Edit, MeasuredViews, SceneSource
@@ -78,7 +78,7 @@ class Services:
         self._read_scene = read_scene
         self._reader = threading.Thread(target=self._read, name="unmix-viewer-scene", daemon=True)
         paths = tuple(str(path.resolve()) for path in environments)
-        with source.borrowed() as scene:
+        with source.locked() as scene:
             for path in paths:
                 relit(scene, LightChoice(path), "of this run")
             self.has_materials = isinstance(scene, TrainedScene)
@@ -142,7 +142,7 @@ class Services:
         def give_up(reason: str) -> None:
             aids.measured = f"the scene is not at hand: {reason}"
 
-        with failures_said("the scene could not be read", give_up):
+        with reporting_failures("the scene could not be read", give_up):
             scene = self._read_scene()
             self.thumbnails = Thumbnails(scene)
             if self.has_materials:
@@ -268,7 +268,7 @@ class Session:
         """A callback for the browser's events: one at a time for each client, with errors shown to it."""
 
         def callback(_event: Any = None) -> None:
-            with self._lock, failures_said("that failed", self.warn):
+            with self._lock, reporting_failures("that failed", self.warn):
                 if not self.is_closed:
                     work()
 
@@ -378,7 +378,7 @@ class Session:
             if pose.aspect < 1:
                 camera.fov = 2 * math.atan(math.tan(pose.fov / 2) / pose.aspect)
 
-    def say_busy(self, what: str) -> None:
+    def show_busy(self, what: str) -> None:
         """Show what is being drawn, in place of what the last picture's colours mean, until it is there."""
         self._status.content = paragraph(f"drawing {what} ...")
         self._legend_shown = self._legend.content = ""
@@ -387,10 +387,10 @@ class Session:
         """The client's camera moved; what it sends may be anything."""
         if self.is_closed:
             return
-        with failures_said("the camera could not be read", self._report):
+        with reporting_failures("the camera could not be read", self._report):
             self.services.loop.change(self.view, pose=pose_from(camera))
 
-    def _show(self, shown: Shown) -> None:
+    def _show(self, shown: Picture) -> None:
         if self.is_closed:
             return
         height, width = shown.picture.shape[:2]

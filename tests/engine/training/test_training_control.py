@@ -18,7 +18,7 @@ from unmix_plugin.engine.training import training_control as device_share
 from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.engine.training.training_control import (
     SHARE_BOUNDS,
-    DeviceShare,
+    DeviceLock,
     Interrupted,
     TrainingControl,
 )
@@ -35,12 +35,12 @@ def in_background(work):
 
 @pytest.fixture
 def contest(monkeypatch):
-    """Part of the time that a guest that always wants more gets beside training, each step taking `STEP_S`."""
+    """Part of the time that a viewer that always wants more gets beside training, each step taking `STEP_S`."""
     now = [0.0]
     monkeypatch.setattr(device_share, "time", SimpleNamespace(perf_counter=lambda: now[0]))
 
     def run(share, cost=1.0, steps=2500):
-        device, taken, is_over = DeviceShare(share), {"guest": 0, "training": 0}, threading.Event()
+        device, taken, is_over = DeviceLock(share), {"viewer": 0, "training": 0}, threading.Event()
         device.is_training = True
 
         def step(turn, who):
@@ -48,25 +48,25 @@ def contest(monkeypatch):
                 now[0] += STEP_S
                 taken[who] += not is_over.is_set()
 
-        def be_guest():
+        def be_viewer():
             while not is_over.is_set():
-                step(device.guest_turn(cost), "guest")
+                step(device.viewing_turn(cost), "viewer")
 
-        guest = in_background(be_guest)
+        viewer = in_background(be_viewer)
         for _ in range(steps):
-            while device._waiting["guest"] == 0:  # the guest is on its way to its next turn
+            while device._waiting["viewer"] == 0:  # the viewer is on its way to its next turn
                 time.sleep(0)
             step(device.training_turn(), "training")
         is_over.set()
         device.is_training = False
-        guest.join(120)
-        return taken["guest"] / sum(taken.values())
+        viewer.join(120)
+        return taken["viewer"] / sum(taken.values())
 
     return run
 
 
 def test_turns_never_overlap():
-    device = DeviceShare(0.5)
+    device = DeviceLock(0.5)
     device.is_training = True
     inside, most = 0, 0
 
@@ -79,53 +79,53 @@ def test_turns_never_overlap():
                 time.sleep(0)  # lets the other thread run, which must not enter
                 inside -= 1
 
-    guest = in_background(lambda: take(device.guest_turn))
+    viewer = in_background(lambda: take(device.viewing_turn))
     take(device.training_turn)
-    guest.join()
+    viewer.join()
     assert most == 1
 
 
-# What an idle guest has saved comes on top, hence a run long enough for it not to count much. Where a guest's second
+# What an idle viewer has saved comes on top, hence a run long enough for it not to count much. Where a viewer's second
 # costs four, 0.4 / 0.6 of training's are earned, and a quarter of them taken.
 @pytest.mark.parametrize(("share", "cost", "part"), [(0.2, 1.0, 0.2), (0.5, 1.0, 0.5), (0.4, 4.0, 1 / 7)])
-def test_a_guest_gets_its_share_and_less_for_work_that_may_wait(contest, share, cost, part):
+def test_a_viewer_gets_its_share_and_less_for_work_that_may_wait(contest, share, cost, part):
     assert contest(share, cost) == pytest.approx(part, abs=0.02)
 
 
-def test_without_training_a_guest_never_waits():
-    device = DeviceShare(0.05)
+def test_without_training_a_viewer_never_waits():
+    device = DeviceLock(0.05)
     started = time.monotonic()
-    with device.guest_turn(1e6):
+    with device.viewing_turn(1e6):
         time.sleep(0.001)
     device.charge(1000.0)
-    with device.guest_turn():
+    with device.viewing_turn():
         pass
     assert time.monotonic() - started < 5
     device.is_training = True
-    assert device.guest_may_go  # what it took before training is forgotten
+    assert device.viewing_may_go  # what it took before training is forgotten
 
 
-def test_a_guest_that_waits_for_credit_goes_on_when_training_ends():
-    device = DeviceShare(0.05)
+def test_a_viewer_that_waits_for_credit_goes_on_when_training_ends():
+    device = DeviceLock(0.05)
     device.is_training = True
     device.charge(1000.0)
     went = threading.Event()
 
-    def be_guest():
-        with device.guest_turn():
+    def be_viewer():
+        with device.viewing_turn():
             went.set()
 
-    guest = in_background(be_guest)
+    viewer = in_background(be_viewer)
     assert not went.wait(0.1)
     device.is_training = False
     assert went.wait(120)
-    guest.join()
+    viewer.join()
 
 
-@pytest.mark.parametrize("inner", ["training_turn", "guest_turn"])
-@pytest.mark.parametrize("outer", ["training_turn", "guest_turn"])
+@pytest.mark.parametrize("inner", ["training_turn", "viewing_turn"])
+@pytest.mark.parametrize("outer", ["training_turn", "viewing_turn"])
 def test_a_turn_within_a_turn_is_refused_and_an_error_in_one_gives_the_device_back(outer, inner):
-    device = DeviceShare()
+    device = DeviceLock()
     refused = pytest.raises(RuntimeError, match="turns do not nest")
     with getattr(device, outer)(), refused, getattr(device, inner)():
         pass
@@ -137,43 +137,43 @@ def test_a_turn_within_a_turn_is_refused_and_an_error_in_one_gives_the_device_ba
 
 def test_shares_stay_within_bounds():
     low, high = SHARE_BOUNDS
-    assert [DeviceShare(share).guest_share for share in (-1.0, 7.0, 0.3, math.nan)] == [low, high, 0.3, low]
+    assert [DeviceLock(share).viewing_share for share in (-1.0, 7.0, 0.3, math.nan)] == [low, high, 0.3, low]
 
 
-def test_a_turn_of_training_that_has_not_begun_comes_after_the_guests_turn_under_way():
-    device, order = DeviceShare(), []
+def test_a_turn_of_training_that_has_not_begun_comes_after_the_viewers_turn_under_way():
+    device, order = DeviceLock(), []
 
     def warm_up():
         with device.training_turn():
             order.append("training")
 
-    with device.guest_turn():
+    with device.viewing_turn():
         training = in_background(warm_up)
         while not device._waiting["training"]:
             time.sleep(0)
     for _ in range(3):
-        with device.guest_turn():
-            order.append("guest")
+        with device.viewing_turn():
+            order.append("viewer")
     training.join(120)
-    assert order == ["training", "guest", "guest", "guest"]
+    assert order == ["training", "viewer", "viewer", "viewer"]
 
 
-def test_guests_have_their_turns_in_the_order_in_which_they_asked():
-    device, order = DeviceShare(), []
+def test_viewers_have_their_turns_in_the_order_in_which_they_asked():
+    device, order = DeviceLock(), []
 
     def draw(name, pictures):
         for _ in range(pictures):
-            with device.guest_turn():
+            with device.viewing_turn():
                 order.append(name)
                 time.sleep(0.005)
 
-    with device.guest_turn():
-        guests = []
+    with device.viewing_turn():
+        viewers = []
         for name in ("page", "picture"):
-            guests.append(in_background(lambda name=name: draw(name, 5)))
-            wait_for(lambda: len(device._waiting["guest"]) == len(guests))
-    for guest in guests:
-        guest.join(120)
+            viewers.append(in_background(lambda name=name: draw(name, 5)))
+            wait_for(lambda: len(device._waiting["viewer"]) == len(viewers))
+    for viewer in viewers:
+        viewer.join(120)
     assert order == ["page", "picture"] * 5
 
 
@@ -199,7 +199,7 @@ def wait_for_rounds(control, number):
 
 
 @pytest.mark.parametrize("average_decay", [None, 0.9])
-def test_a_guest_on_the_device_changes_nothing_of_a_training(short_config, average_decay):
+def test_a_viewer_on_the_device_changes_nothing_of_a_training(short_config, average_decay):
     config = replace(short_config, average_decay=average_decay)
     alone, watched = quiet_trainer(config), quiet_trainer(config)
     alone.train()
@@ -208,16 +208,16 @@ def test_a_guest_on_the_device_changes_nothing_of_a_training(short_config, avera
 
     def watch():
         while not is_over.is_set():
-            with watched.control.device.guest_turn():
+            with watched.control.device.viewing_turn():
                 training = model.training
                 model.eval()
                 model.get_outputs_for_camera(camera)
                 model.train(training)
 
-    guest = in_background(watch)
+    viewer = in_background(watch)
     watched.train()
     is_over.set()
-    guest.join()
+    viewer.join()
     expected, actual = newest(alone.run.path).tensors, newest(watched.run.path).tensors
     assert set(expected) == set(actual)
     for name, tensor in expected.items():
@@ -291,7 +291,7 @@ def test_a_stop_ends_training_as_ctrl_c_does_and_it_can_go_on(short_config, is_p
     assert resumed.step == 12
 
 
-def test_a_guest_that_leaves_the_model_in_evaluation_mode_does_not_change_the_next_step(short_config):
+def test_a_viewer_that_leaves_the_model_in_evaluation_mode_does_not_change_the_next_step(short_config):
     trainer = quiet_trainer(short_config)
     modes = []
 

@@ -127,7 +127,7 @@ def test_pictures_that_would_not_fit_are_refused():
 @pytest.mark.parametrize("layer", [name for name in LAYERS if name not in captures._NO_VIDEO])
 def test_every_layer_that_renders_know_is_an_output_of_theirs(layer, source):
     chosen = LayerSettings(layer, wavelength_nm=500.0, index="r650 / r500")
-    with source.borrowed() as scene:
+    with source.locked() as scene:
         products = choose_formats((captures.output_of(chosen, scene.bands),), ("mp4",), scene, True)
     assert [product.format for product in products] == ["mp4"]
     if layer in ("band", "false-colour"):  # the first settings are outputs for bands anywhere

@@ -25,7 +25,7 @@ from unmix_plugin.viewer.view_cameras import camera_of, pose_of
 def test_blocks_give_what_the_scene_gives_at_once(tmp_path, specular, subpixels, block):
     source = make_source(tmp_path, specular=specular)
     camera = camera_of(pose_of(source.record.train_cameras[0]), 6)
-    with source.borrowed() as scene:
+    with source.locked() as scene:
         assert isinstance(scene, TrainedScene)
         expected = scene.look(camera, subpixels).coefficients
         render = pictures.FrameRender(camera, subpixels)

@@ -56,7 +56,7 @@ def test_a_movement_is_answered_with_a_small_picture_and_rest_with_finer_ones(lo
     assert heights == sorted(set(heights))
     assert [shown.is_moving for shown in screen.shown] == [True] * (len(heights) - 1) + [False]
     assert not loop.step()
-    with source.borrowed() as scene:
+    with source.locked() as scene:
         expected = scene.look(camera_of(some_pose(), LARGEST), subpixels=1).coefficients
     found = screen.view.frame.coefficients.abundances
     torch.testing.assert_close(found, expected.abundances, atol=1e-5, rtol=1e-5)
@@ -174,7 +174,7 @@ def test_a_picture_never_takes_more_memory_than_is_set_aside(source, monkeypatch
     loop.add(screen.view)
     loop.change(screen.view, pose=some_pose())
     picture = finest(loop, screen).picture
-    with source.borrowed() as scene:
+    with source.locked() as scene:
         channels = _num_channels(scene.materials)
     assert picture.shape[0] * picture.shape[1] * channels * 4 <= 20_000
 
@@ -250,7 +250,7 @@ def training(tmp_path):
 def test_while_training_runs_pictures_follow_it(training, monkeypatch):
     monkeypatch.setattr("unmix_plugin.viewer.rendering.pictures.REFRESH_S", 0.05)
     control, model, _, loop, screen = training
-    control.device.guest_share = 0.8
+    control.device.viewing_share = 0.8
     with control.running():
         loop.change(screen.view, pose=some_pose())
         until = time.monotonic() + 120

@@ -139,7 +139,7 @@ class TrainingSteps:
         """Take step number `step` at `progress` in [0, 1]. Raises RunError: loss and gradients stay non-finite, or
         another process has ended."""
         pipeline, datamanager = self.pipeline, self.pipeline.datamanager
-        pipeline.train()  # a guest may have left it in evaluation mode
+        pipeline.train()  # a viewer may have left it in evaluation mode
         pipeline.seed_step(step)
         run_callbacks(self.callbacks, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, step, progress)
         with torch.no_grad():

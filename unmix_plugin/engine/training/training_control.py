@@ -14,51 +14,51 @@ from typing import Literal
 from unmix_plugin.engine.training.progress import TrainingStatus
 
 SHARE_BOUNDS = (0.05, 0.9)
-"""Least and greatest share of a guest."""
+"""Least and greatest share of a viewer."""
 
 _LARGEST_CREDIT_S = 0.25
-"""What a guest that was idle may take at once before the proportion holds again."""
+"""What a viewer that was idle may take at once before the proportion holds again."""
 
 
-class DeviceShare:
+class DeviceLock:
     """Lets training and others compute by turns, so that they never meet on the device or in the weights.
 
-    Turns do not nest, and guests have theirs in the order in which they asked.
+    Turns do not nest, and viewers have theirs in the order in which they asked.
 
-    While training runs, each second of it earns the guest share / (1 - share) seconds of credit. A guest with credit
-    goes before the next training step, one without waits. Before training runs, and while it is paused, a guest needs
-    no credit, and a turn of training is the next after the guest's turn under way.
+    While training runs, each second of it earns the viewer share / (1 - share) seconds of credit. A viewer with credit
+    goes before the next training step, one without waits. Before training runs, and while it is paused, a viewer needs
+    no credit, and a turn of training is the next after the viewer's turn under way.
     """
 
-    def __init__(self, guest_share: float = 0.3) -> None:
+    def __init__(self, viewing_share: float = 0.3) -> None:
         """Start with nobody computing.
 
         Args:
-            guest_share: Part of the device's time that the guest may take while training runs.
+            viewing_share: Part of the device's time that the viewer may take while training runs.
         """
         self._turn = threading.Condition()
         self._owner: int | None = None
         self._is_training = False
-        self._waiting: dict[str, list[object]] = {"training": [], "guest": []}
+        self._waiting: dict[str, list[object]] = {"training": [], "viewer": []}
         self._last = "training"
         self._credit_s = _LARGEST_CREDIT_S
-        self.guest_share = guest_share
+        self.viewing_share = viewing_share
         self.training_turns = 0
         """Turns that training has had."""
 
     @property
-    def guest_share(self) -> float:
-        """Part of the device's time that the guest may take while training runs, within `SHARE_BOUNDS`."""
-        return self._guest_share
+    def viewing_share(self) -> float:
+        """Part of the device's time that the viewer may take while training runs, within `SHARE_BOUNDS`."""
+        return self._viewing_share
 
-    @guest_share.setter
-    def guest_share(self, share: float) -> None:
+    @viewing_share.setter
+    def viewing_share(self, share: float) -> None:
         low, high = SHARE_BOUNDS
-        self._guest_share = min(max(low, share), high)  # in this order NaN becomes the least
+        self._viewing_share = min(max(low, share), high)  # in this order NaN becomes the least
 
     @property
     def is_training(self) -> bool:
-        """Whether the guest has to share."""
+        """Whether the viewer has to share."""
         return self._is_training
 
     @is_training.setter
@@ -69,43 +69,43 @@ class DeviceShare:
 
     @contextmanager
     def training_turn(self) -> Iterator[None]:
-        """Context in which training has the device; earns the guest credit."""
-        earned_a_second = self._guest_share / (1 - self._guest_share)
-        with self._turn_of("training", lambda: not self._guest_goes_first, earned_a_second):
+        """Context in which training has the device; earns the viewer credit."""
+        earned_a_second = self._viewing_share / (1 - self._viewing_share)
+        with self._turn_of("training", lambda: not self._viewing_goes_first, earned_a_second):
             try:
                 yield
             finally:
                 self.training_turns += 1
 
-    def guest_turn(self, cost: float = 1.0) -> AbstractContextManager[None]:
-        """Context in which the guest has the device.
+    def viewing_turn(self, cost: float = 1.0) -> AbstractContextManager[None]:
+        """Context in which the viewer has the device.
 
         Args:
             cost: Seconds of credit that a second takes; more than 1 for work that may wait.
         """
-        return self._turn_of("guest", lambda: self.guest_may_go and not self._training_goes_first, -cost)
+        return self._turn_of("viewer", lambda: self.viewing_may_go and not self._training_goes_first, -cost)
 
     def charge(self, seconds: float) -> None:
-        """Count time that the guest computed outside its turns, on processors that training could have used."""
+        """Count time that the viewer computed outside its turns, on processors that training could have used."""
         with self._turn:
             self._earn(-seconds)
 
     @property
-    def guest_may_go(self) -> bool:
-        """Whether the guest need not wait for credit."""
+    def viewing_may_go(self) -> bool:
+        """Whether the viewer need not wait for credit."""
         return not self._is_training or self._credit_s > 0
 
     @property
-    def _guest_goes_first(self) -> bool:
-        return bool(self._waiting["guest"]) and self.guest_may_go and not self._training_goes_first
+    def _viewing_goes_first(self) -> bool:
+        return bool(self._waiting["viewer"]) and self.viewing_may_go and not self._training_goes_first
 
     @property
     def _training_goes_first(self) -> bool:
-        return bool(self._waiting["training"]) and self._last == "guest" and not self._is_training
+        return bool(self._waiting["training"]) and self._last == "viewer" and not self._is_training
 
     @contextmanager
     def _turn_of(
-        self, who: Literal["training", "guest"], may_go: Callable[[], bool], credit_a_second: float
+        self, who: Literal["training", "viewer"], may_go: Callable[[], bool], credit_a_second: float
     ) -> Iterator[None]:
         with self._turn:
             if self._owner == threading.get_ident():
@@ -139,7 +139,7 @@ class TrainingControl:
     """Joins a trainer with whoever watches it. Everything asked for happens between two steps."""
 
     def __init__(self) -> None:
-        self.device = DeviceShare()
+        self.device = DeviceLock()
         """Turns with others that compute on the same device."""
         self.status: TrainingStatus | None = None
         """How far training has come, renewed a few times a second; None before the first step."""

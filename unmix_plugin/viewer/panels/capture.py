@@ -18,7 +18,7 @@ from unmix_plugin.formats.files import rgba_png_bytes, write_file
 from unmix_plugin.trained.camera_files import camera_file_bytes
 from unmix_plugin.trained.protocol import RenderedView
 from unmix_plugin.trained.run_views import RunView, world_frame
-from unmix_plugin.viewer.page import failures_said, index_in, new_file, number, number_of
+from unmix_plugin.viewer.page import index_in, new_file, number, number_of, reporting_failures
 from unmix_plugin.viewer.rendering.captures import (
     SIDE_BOUNDS,
     VideoJob,
@@ -125,7 +125,7 @@ class CapturePanel:
         self._capture = cancelled
 
         def work() -> None:
-            with failures_said("the picture failed", lambda reason: session.warn(reason, "no picture")):
+            with reporting_failures("the picture failed", lambda reason: session.warn(reason, "no picture")):
                 try:
                     found = joined_strips(map(read, strips), camera.height)
                 finally:

@@ -139,7 +139,12 @@ class MaterialsPanel:
         self._known_source = gui.add_html("")
         self._session.add_button("replace by the known material", self._replace)
         self._other = gui.add_dropdown("other endmember", names, initial_value=names[-1])
-        self._session.add_button("swap with the other", self._swap)
+        self._session.add_button(
+            "swap with the other",
+            lambda: self._change_recipe(
+                recipes.with_swap(self._recipe, Swap(self._index, index_in(self._other)))
+            ),
+        )
 
     # Recipes.
 
@@ -232,9 +237,6 @@ class MaterialsPanel:
         if name:
             self._change(Rename(self._named, name))
 
-    def _swap(self) -> None:
-        self._change_recipe(recipes.with_swap(self._recipe, Swap(self._index, index_in(self._other))))
-
     def _chosen_known(self) -> LibraryMaterial | None:
         name = text(self._known.value)
         return None if name == _NO_MATERIAL else self._library.find(name)
@@ -299,7 +301,10 @@ class MaterialsPanel:
             gloss_colour = reached.get(("gloss", index)) if gloss and gloss.colour else None
             self._gloss_colour.value = _bytes(gloss_colour) if gloss_colour else _WHITE
             colour = reached.get(("retint", index)) if retint else None
-            self._colour.value = _bytes(_colour_of(materials, index) if colour is None else colour)
+            if colour is None:  # that of its spectrum in full light
+                linear = materials.endmembers[index] @ rgb_matrix(materials.bands).to(materials.endmembers)
+                colour = linear_to_srgb(linear.clamp(0, 1)).cpu()
+            self._colour.value = _bytes(colour)
             # While a name is typed the field is the user's: "blue " may become "blue cloth".
             if not self._typed_name.is_waiting and text(self._name.value).strip() != materials.names[index]:
                 self._name.value = materials.names[index]
@@ -332,9 +337,3 @@ def _srgb(value: Any) -> tuple[float, float, float]:
 def _bytes(srgb: Any) -> tuple[int, int, int]:
     red, green, blue = (torch.as_tensor(srgb) * 255).round().int().tolist()
     return red, green, blue
-
-
-def _colour_of(materials: Materials, index: int) -> torch.Tensor:
-    """sRGB colour of an endmember's spectrum in full light."""
-    linear = materials.endmembers[index] @ rgb_matrix(materials.bands).to(materials.endmembers)
-    return linear_to_srgb(linear.clamp(0, 1)).cpu()

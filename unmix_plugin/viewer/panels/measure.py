@@ -42,7 +42,7 @@ class MeasurePanel:
         session.on_tick.append(self._follow)
 
     def _take(self, camera: Cameras, place: tuple[float, float]) -> None:
-        with self._session.services.maker.shown_turn(self._session.view.edit) as (_, shown):
+        with self._session.services.maker.locked_view(self._session.view.edit) as (_, shown):
             _, point, world = surface_at(shown, camera, place)
         self._points = [*self._points[: len(self._points) % 2], (point, world)]
         self._show()
@@ -92,7 +92,7 @@ class MeasurePanel:
             raise ConfigError("click two points of the object first, then type how far apart they are")
         first, second = (world.tolist() for _, world in self._points)
         scale = scale_between(first, second, number(self._metres.value, 0.0, np.inf, fallback=0.0))
-        with source.borrowed() as scene:
+        with source.locked() as scene:
             require_on_surface(scene, first)
             require_on_surface(scene, second)
         keep_scale(source.run, scale)

@@ -87,7 +87,7 @@ def _take_probe(
 ) -> _ProbedPoint:
     """What is seen at a place of a picture, and what training views measured there."""
     views = maker.aids.measured
-    with maker.edit_turn(edit) as (_, shown):
+    with maker.locked_edit(edit) as (_, shown):
         seen = surface_at(shown, camera, place)
         pixels = () if isinstance(views, str) else views.measured.pixels_that_see(seen[1], shown)
     measured = None if isinstance(views, str) else views.measured.spectra(pixels, shown)
@@ -277,7 +277,7 @@ class ValuesPanel:
         self._text.content = paragraph(f"The light has changed. {_INVITATION}")
 
     def _take(self, camera: Cameras, place: tuple[float, float]) -> None:
-        with self._session.services.maker.shown_turn(self._session.view.edit) as (_, shown):
+        with self._session.services.maker.locked_view(self._session.view.edit) as (_, shown):
             found = shown.probe(camera, int(place[0]), int(place[1]))
         rows = [(name, _first_numbers(values)) for name, values in found.values.items()]
         if found.world_position is not None:

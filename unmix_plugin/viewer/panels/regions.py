@@ -14,7 +14,7 @@ from unmix_plugin.errors import ConfigError
 from unmix_plugin.trained.measured_surface import MeasuredRegion, MeasuredSurface
 from unmix_plugin.trained.measures import describe_area
 from unmix_plugin.trained.regions import InView, Region, check_name, polygon_mask
-from unmix_plugin.viewer.page import Chart, Line, bars, failures_said, paragraph, table, text
+from unmix_plugin.viewer.page import Chart, Line, bars, paragraph, reporting_failures, table, text
 from unmix_plugin.viewer.panels.probe import add_click_switch
 from unmix_plugin.viewer.session import Session
 from unmix_plugin.viewer.view_cameras import pose_of
@@ -126,7 +126,7 @@ class RegionsPanel:
                 self._progress.content = paragraph(f"{what} ...") if what else ""
 
         def work() -> None:
-            with failures_said("the region could not be measured", session.warn):
+            with reporting_failures("the region could not be measured", session.warn):
                 try:
                     regions.measure(name, region, show)
                 finally:

@@ -27,12 +27,12 @@ class TrainingPanel:
         self._state = gui.add_html("")
         self._bar = gui.add_progress_bar(0.0)
         self._pause = session.add_button("pause", self._toggle)
-        save = session.add_button("save a checkpoint", self._save)
+        save = session.add_button("save a checkpoint", self._save_checkpoint)
         self._sure = gui.add_checkbox("really stop", False)
         stop = session.add_button("stop training", self._stop, "red")
         self._steering = (self._pause, save, self._sure, stop)
         hint = "Of the device's time, while someone moves."
-        share = gui.add_slider("viewer's share", *SHARE_BOUNDS, 0.05, control.device.guest_share, hint=hint)
+        share = gui.add_slider("viewer's share", *SHARE_BOUNDS, 0.05, control.device.viewing_share, hint=hint)
         self._share = session.on_change(share, self._change_share)
         self._charts = [Chart(gui, title, "step") for _, title, _ in _CURVES]
         self._tick()
@@ -69,7 +69,7 @@ class TrainingPanel:
             self._control.pause()
         self._tick()
 
-    def _save(self) -> None:
+    def _save_checkpoint(self) -> None:
         self._control.request_save()
         self._session.say("saving", "a checkpoint is saved after the step under way")
 
@@ -83,7 +83,7 @@ class TrainingPanel:
 
     def _change_share(self) -> None:
         device = self._control.device
-        device.guest_share = number_of(self._share, device.guest_share)
+        device.viewing_share = number_of(self._share, device.viewing_share)
 
 
 def _rows(status: TrainingStatus | None, condition: str, is_running: bool) -> list[tuple[str, str]]:

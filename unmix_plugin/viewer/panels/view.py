@@ -17,7 +17,7 @@ from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.maps.indices import available_indices
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.model_scene import LightChoice
-from unmix_plugin.viewer.page import Debounced, choice, failures_said, index_in, number, number_of, text
+from unmix_plugin.viewer.page import Debounced, choice, index_in, number, number_of, reporting_failures, text
 from unmix_plugin.viewer.recipes import is_shown
 from unmix_plugin.viewer.rendering.painting import layer_named
 from unmix_plugin.viewer.rendering.pictures import DEFAULT_HEIGHT, HEIGHT_BOUNDS, SUBPIXEL_BOUNDS
@@ -169,7 +169,7 @@ class LayerPanel:
             self._show_controls()
         if setting == "layer":
             self._own_range.value = False  # such ends mean nothing of other values
-            self._session.say_busy(layer_named(self._settings.layer, self._layers).title)
+            self._session.show_busy(layer_named(self._settings.layer, self._layers).title)
         self._session.services.loop.change(self._session.view, settings=self._settings)
 
     def _show_controls(self) -> None:
@@ -225,7 +225,8 @@ class ScenePanel:
         self._objects: dict[str, list[Any]] = {}
         self._reader: threading.Thread | None = None
         """Reads images of cameras."""
-        session.on_close.append(self._wait_for_reader)
+        # A thread in native code when the interpreter ends takes the process down with it.
+        session.on_close.append(lambda: self._reader and self._reader.join(_READ_S))
         gui, services = session.client.gui, session.services
         self._views = {view.name: view.camera for view in services.views}
         with gui.add_folder("camera"):
@@ -249,11 +250,6 @@ class ScenePanel:
             if services.has_materials:
                 self._add_switch("point cloud", self._add_points)
                 session.on_edit.append(self._renew_points)
-
-    def _wait_for_reader(self) -> None:
-        # A thread in native code when the interpreter ends takes the process down with it.
-        if self._reader is not None:
-            self._reader.join(_READ_S)
 
     def _renew_points(self) -> None:
         """Materials may have other colours, or be hidden."""
@@ -316,7 +312,7 @@ class ScenePanel:
     def _read_images(self, thumbnails: Thumbnails, frusta: list[viser.CameraFrustumHandle]) -> None:
         """Give frusta their images one by one, while pages go on, until the frusta are removed."""
         session = self._session
-        with failures_said("images of the views could not be read", session.warn):
+        with reporting_failures("images of the views could not be read", session.warn):
             for name, frustum in zip(self._views, frusta, strict=True):
                 image = thumbnails.of(name)
 

@@ -19,7 +19,7 @@ from unmix_plugin.spectral.subspace import PcaColours
 from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.trained.run_materials import endmember_colours
 from unmix_plugin.trained.trained_scene import TrainedScene
-from unmix_plugin.viewer.rendering.scene import STEPS_KEPT, MeasuredViews, Renewed, SceneSource
+from unmix_plugin.viewer.rendering.scene import STEPS_KEPT, CachedByVersion, MeasuredViews, SceneSource
 
 _NUM_CAMERAS = 6
 _NUM_RAYS = 6000
@@ -59,7 +59,9 @@ class LayerAids:
     scene_box: SceneBox
     measured: MeasuredViews | str = "the scene is not at hand"
     """What the training views measured, or why that is unknown."""
-    _kept: Renewed = field(default_factory=lambda: Renewed(_MOST_REMEMBERED), repr=False, compare=False)
+    _kept: CachedByVersion = field(
+        default_factory=lambda: CachedByVersion(_MOST_REMEMBERED), repr=False, compare=False
+    )
     """Colours and principal components, by the materials that clients look at."""
 
     def reference_spectra(self, materials: Materials) -> Float[Tensor, "N B"]:
@@ -99,14 +101,14 @@ class SceneAids:
         self.measured: MeasuredViews | str = "the scene is still being read"
         """What the training views measured, or why that is unknown: noted by another thread at any moment."""
         self._source = source
-        self._for_layers, self._seen = Renewed(_EDITS_KEPT), Renewed(2)
+        self._for_layers, self._seen = CachedByVersion(_EDITS_KEPT), CachedByVersion(2)
 
     def for_layers(self, scene: TrainedScene) -> LayerAids:
-        """What layers of a scene, unedited or edited, need. Must not be called while the scene is lent."""
+        """What layers of a scene, unedited or edited, need. Must not be called while the device is locked."""
         record, is_training = self._source.record, self._source.device.is_training
 
         def make() -> LayerAids:
-            with self._source.borrowed():
+            with self._source.locked():
                 return LayerAids(*render_reference(scene, record.train_cameras), record.scene_box)
 
         # What a training has ended with is looked at for long.
@@ -115,6 +117,6 @@ class SceneAids:
         return replace(aids, measured=self.measured)
 
     def see(self, scene: TrainedScene) -> Coefficients:
-        """What the training cameras see of the scene, or of what edits leave of it, not long ago; called while it is
-        lent."""
+        """What the training cameras see of the scene, or of what edits leave of it, not long ago; called while the
+        device is locked."""
         return self._seen.get(scene.visibility, self._source.version, lambda: sample_seen(scene))

@@ -206,7 +206,7 @@ def _picture_depth(frame: MaterialView) -> Float32[np.ndarray, "rows columns"]:
 
 
 @dataclass(frozen=True)
-class Shown:
+class Picture:
     """A picture for one client."""
 
     picture: UInt8[np.ndarray, "H W 3"]
@@ -240,7 +240,7 @@ class PictureMaker:
     def __init__(self, source: SceneSource) -> None:
         self.source = source
         self.speed = _Speedometer()
-        with source.borrowed() as scene:
+        with source.locked() as scene:
             self.layers = layers_of(scene)
             """What can be shown, by name."""
             is_mixed = isinstance(scene, TrainedScene)
@@ -270,13 +270,13 @@ class PictureMaker:
         largest = camera_of(pose, largest_height, self._largest_pixels).height
         if not self.source.device.is_training:
             return largest
-        share = self.source.device.guest_share
+        share = self.source.device.viewing_share
         speed = self.speed.rays_per_second * share / (share + RESTING_COST * (1 - share))
         return max(1, min(int(math.sqrt(speed * REFRESH_S / pose.aspect)), largest))
 
     def advance(self, render: FrameRender, edit: Edit, num_rays: int, cost: float) -> RenderedView | None:
         """Render a block; the frame if that was the last, an UnmixError if the edit does not fit the run."""
-        with self.source.borrowed(cost) as scene, torch.no_grad():
+        with self.source.locked(cost) as scene, torch.no_grad():
             shown = edit.apply(scene, self.source.version, self.aids.see)
             started = time.perf_counter()
             rays = render.render_block(shown, num_rays)
@@ -287,26 +287,28 @@ class PictureMaker:
 
     def edited(self, edit: Edit) -> TrainedScene:
         """The scene after an edit; an UnmixError if the edit does not fit the run."""
-        with self.edit_turn(edit) as (_, shown):
+        with self.locked_edit(edit) as (_, shown):
             return shown
 
     @contextmanager
-    def edit_turn(self, edit: Edit) -> Iterator[tuple[TrainedScene, TrainedScene]]:
+    def locked_edit(self, edit: Edit) -> Iterator[tuple[TrainedScene, TrainedScene]]:
         """Context with the scene before and after an edit, and the device; an UnmixError if the edit does not fit."""
-        with self.shown_turn(edit) as (scene, shown):
+        with self.locked_view(edit) as (scene, shown):
             yield require_materials(scene, "of this run"), require_materials(shown, "of this run")
 
     @contextmanager
-    def shown_turn(self, edit: Edit) -> Iterator[tuple[RenderableScene, RenderableScene]]:
+    def locked_view(self, edit: Edit) -> Iterator[tuple[RenderableScene, RenderableScene]]:
         """The same for the scene of any method."""
-        with self.source.borrowed() as scene:
+        with self.source.locked() as scene:
             yield scene, edit.apply(scene, self.source.version, self.aids.see)
 
     def with_materials_of(self, edit: Edit, frame: RenderedView) -> RenderedView:
         """What a frame would be with other materials on the same shapes; an UnmixError if the edit does not fit."""
         return replace(frame, scene=self.edited(edit)) if isinstance(frame, MaterialView) else frame
 
-    def paint(self, frame: RenderedView, settings: LayerSettings, with_depth: bool, is_moving: bool) -> Shown:
+    def paint(
+        self, frame: RenderedView, settings: LayerSettings, with_depth: bool, is_moving: bool
+    ) -> Picture:
         """A frame as a picture; an UnmixError if the layer can't be shown."""
         layer = layer_named(settings.layer, self.layers)
         aids = self.aids.for_layers(frame.scene) if isinstance(frame, MaterialView) else None
@@ -317,7 +319,7 @@ class PictureMaker:
                 frame = frame.map(lambda packed: packed * is_left)
             picture, legend = layer.paint(frame, settings, aids)
         depth = _picture_depth(frame) if with_depth and isinstance(frame, MaterialView) else None
-        return Shown(as_bytes(picture), depth, legend, is_moving, layer.is_labels)
+        return Picture(as_bytes(picture), depth, legend, is_moving, layer.is_labels)
 
 
 def wants_more(frame: RenderedView) -> bool:

@@ -93,5 +93,5 @@ class RunRegions:
         """The device and the unedited scene, after pages that wait; a ConfigError once stopped."""
         if self._is_stopping:
             raise ConfigError("the viewer was stopped")
-        with self._maker.edit_turn(Edit()) as (scene, _):
+        with self._maker.locked_edit(Edit()) as (scene, _):
             yield scene

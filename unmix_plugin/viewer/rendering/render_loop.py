@@ -17,13 +17,13 @@ from typing import Any
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.trained.protocol import RenderedView
-from unmix_plugin.viewer.page import failures_said
+from unmix_plugin.viewer.page import reporting_failures
 from unmix_plugin.viewer.rendering.pictures import (
     DEFAULT_HEIGHT,
     RESTING_COST,
     FrameRender,
+    Picture,
     PictureMaker,
-    Shown,
     wants_more,
 )
 from unmix_plugin.viewer.rendering.scene import Edit
@@ -40,7 +40,7 @@ _STRIP_PIXELS = 1 << 17
 class View:
     """What one client looks at, and how far its picture has come; changed only under the loop's lock."""
 
-    show: Callable[[Shown], None]
+    show: Callable[[Picture], None]
     """Sends a picture."""
     report: Callable[[str], None]
     """Says what went wrong; an empty text that all is well again."""
@@ -209,7 +209,7 @@ class RenderLoop:
         if waiting := self._waiting:
             first = min(waiting, key=lambda view: view._asked_at or 0.0)
             return lambda: self._guarded(first, self._answer if first.moved_at is not None else self._redraw)
-        if not self._maker.source.device.guest_may_go:
+        if not self._maker.source.device.viewing_may_go:
             return None
         unfinished = [view for view in self._active if self._has_more(view)]
         served = min(unfinished, key=lambda view: view.served_at, default=None)
@@ -233,7 +233,7 @@ class RenderLoop:
                 view.render = view.moved_at = view.restyled_at = None
             view.report(reason)
 
-        with failures_said("this picture failed", fail):
+        with reporting_failures("this picture failed", fail):
             work(view)
 
     def _answer(self, view: View) -> None:

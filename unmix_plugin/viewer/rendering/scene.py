@@ -22,7 +22,7 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.runs.load_run import SceneRecord
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.engine.training.trainer import Trainer
-from unmix_plugin.engine.training.training_control import DeviceShare, TrainingControl
+from unmix_plugin.engine.training.training_control import DeviceLock, TrainingControl
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Coefficients
@@ -41,7 +41,7 @@ STEPS_KEPT = 200
 """What was rendered so many training steps ago is rendered again."""
 
 
-class Renewed:
+class CachedByVersion:
     """Values by key, made again once training has changed the scene."""
 
     def __init__(self, most: int) -> None:
@@ -68,25 +68,25 @@ class SceneSource:
     """Where what the viewer writes goes."""
     record: SceneRecord
     """What the run keeps of its input."""
-    device: DeviceShare
+    device: DeviceLock
     """Turns with training, if there is one."""
     take: Callable[[], RenderableScene]
     """The scene at this moment; called while training waits."""
     control: TrainingControl | None = None
     """The training under way; None for a finished run."""
-    _taken: Renewed = field(default_factory=lambda: Renewed(1), repr=False)
+    _taken: CachedByVersion = field(default_factory=lambda: CachedByVersion(1), repr=False)
 
     @contextmanager
-    def borrowed(self, cost: float = 1.0) -> Iterator[RenderableScene]:
-        """Context with the scene and the device to render it; `cost` as `DeviceShare.guest_turn` has it. Turns do not
+    def locked(self, cost: float = 1.0) -> Iterator[RenderableScene]:
+        """Context with the scene and the device to render it; `cost` as `DeviceLock.viewing_turn` has it. Turns do not
         nest: whoever has the device must not ask for it again."""
-        with self.device.guest_turn(cost):
+        with self.device.viewing_turn(cost):
             yield self._taken.get(None, self.version, self.take, steps=1)
 
     @contextmanager
-    def borrowed_materials(self) -> Iterator[TrainedScene]:
+    def locked_materials(self) -> Iterator[TrainedScene]:
         """The same for a scene that must have endmembers; a ConfigError if it has none."""
-        with self.borrowed() as scene:
+        with self.locked() as scene:
             yield require_materials(scene, "of this run")
 
     @property
@@ -109,7 +109,7 @@ class SceneSource:
 
 def source_of_run(run: LoadedRun) -> SceneSource:
     """The scene of a finished run."""
-    return SceneSource(run.folder, run.record, DeviceShare(), lambda: run.scene)
+    return SceneSource(run.folder, run.record, DeviceLock(), lambda: run.scene)
 
 
 def source_of_training(trainer: Trainer, record: SceneRecord) -> SceneSource:
@@ -121,7 +121,7 @@ def source_of_training(trainer: Trainer, record: SceneRecord) -> SceneSource:
         return snapshot(model, name, record, averages)
 
     source = SceneSource(trainer.run, record, trainer.control.device, take, trainer.control)
-    with source.borrowed():
+    with source.locked():
         pass  # refuses a method without a scene before the page is served
     return source
 
@@ -154,7 +154,7 @@ class Edit:
     def apply(
         self, scene: RenderableScene, version: int, see: Callable[[TrainedScene], Coefficients]
     ) -> RenderableScene:
-        """The edited scene, a ConfigError if the recipe does not fit the run; must be called while the scene is lent.
+        """The edited scene, a ConfigError if the recipe does not fit the run; to be called while the device is locked.
         `version` rises as training changes it; `see` is asked what cameras see if the recipe depends on pictures."""
         if not self.has_recipe and self.light == LightChoice():
             return scene
@@ -181,7 +181,7 @@ class MeasuredViews:
         self.measured = MeasuredScene(scene, source.record.summary.get("illuminant"))
         """What places measured, as exports have it."""
         self._source = source
-        self._distances = Renewed(_VIEWS_KEPT)
+        self._distances = CachedByVersion(_VIEWS_KEPT)
 
     def error(self, frame: MaterialView) -> tuple[Float[Tensor, "H W"], Bool[Tensor, "H W"], str]:
         """Mean absolute error of the bands against the nearest training view, where that measured the same point; where
@@ -231,7 +231,7 @@ class MeasuredViews:
         """Distances along the rays of a training view as last rendered, infinite where nothing is."""
 
         def render() -> Float[Tensor, "H W"]:
-            with self._source.borrowed_materials() as scene:
+            with self._source.locked_materials() as scene:
                 seen = scene.look(camera, subpixels=1).coefficients
             return seen.ray_distance.where(seen.is_occupied, torch.inf).cpu()
 
