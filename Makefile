@@ -12,7 +12,7 @@ BENCHMARKS := $(filter-out benchmarks/fuzz_guided.py,$(sort $(wildcard benchmark
 MINIMUM := .venv-minimum
 MINIMUM_TESTS := tests/engine tests/spectral tests/editing tests/formats tests/scenes tests/figures tests/viewer/test_server.py tests/captures/readers
 
-.PHONY: demo test cases test-random test-all test-minimum test-portable wheel platforms audit lint format bench notebooks site clean help
+.PHONY: results-check demo test cases test-random test-all test-minimum test-portable wheel platforms audit lint format bench notebooks site clean help
 
 help:
 	@echo "make demo    train on the built-in scene, evaluate, export abundance maps and a page to share"
@@ -28,6 +28,7 @@ help:
 	@echo "make lint    check format, lint rules, types and the import law"
 	@echo "make format  rewrite the code in the one format"
 	@echo "make bench   run every benchmark, results into benchmarks/results"
+	@echo "make results-check   say which results that docs cite have to be measured again"
 	@echo "make site    build the site from docs/ into build/site/html, and check its links"
 	@echo "make notebooks   run the tutorials"
 	@echo "make clean   remove the virtual environment and caches"
@@ -109,6 +110,10 @@ format: $(VENV)/.installed-dev
 
 bench: $(VENV)/.installed-dev
 	@set -e; for benchmark in $(BENCHMARKS); do echo "== $$benchmark"; $(BIN)/python $$benchmark; done
+
+# Apart from the tests, since it needs the history: which results that docs cite are dirty, unknown, or old.
+results-check: | $(BIN)/python
+	$(BIN)/python scripts/check_results.py
 
 notebooks: $(VENV)/.installed-dev
 	$(BIN)/python scripts/run_notebooks.py

@@ -177,6 +177,21 @@ def scene_folder(name: str) -> Path:
     return folder
 
 
+def require_data(data: Path, what: str, remedy: str = "") -> None:
+    """End with status 2 where the data of a benchmark are missing, and say which command makes them.
+
+    Args:
+        data: A file or folder that has to be there.
+        what: What it is.
+        remedy: How to get it; if not given, how to render scenes.
+    """
+    if data.exists():
+        return
+    made = f"python benchmarks/scenes.py renders scenes into {scenes_folder()}; name that folder, or one scene in it"
+    print(f"{what} is missing: {data}. {remedy or made}", file=sys.stderr)
+    raise SystemExit(2)
+
+
 @dataclass(frozen=True)
 class Ended:
     """A command that has ended."""

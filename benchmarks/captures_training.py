@@ -81,12 +81,16 @@ def main(options: Options) -> None:
     with ExitStack() as stack:
         place = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="unmix-captures-")))
         scenes = _scenes(options, place)
+        if not scenes:
+            _common.require_data(
+                options.shared / "scenes/turntable",
+                "every capture that was asked for (--shared)",
+                "docs/background/real-captures.md says where Basil is to be had; put it into real/basil of that folder",
+            )
         for name, words in scenes.items():
             _common.publish(
                 report(name, words, options, place), _common.results_folder(options.results, options.quick)
             )
-    if not scenes:
-        print(f"no scene to measure in {options.shared}")
 
 
 def report(name: str, words: list[str], options: Options, place: Path) -> _common.Report:

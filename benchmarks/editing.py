@@ -57,9 +57,8 @@ class Options:
 
 def main(options: Options) -> None:
     """Measure and publish."""
-    if options.run is None and not (options.scene / "transforms.json").is_file():
-        print(f"no scene to edit: {options.scene} has no transforms.json; name one with --scene")
-        return
+    if options.run is None:
+        _common.require_data(options.scene / "transforms.json", "the scene to edit (--scene)")
     machine = _machine.describe_machine(options.device)
     seconds = 3.0 if options.quick else options.max_seconds
     with tempfile.TemporaryDirectory(prefix="unmix-editing-") as folder:

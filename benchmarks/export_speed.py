@@ -52,8 +52,6 @@ def main(options: Options) -> None:
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="unmix-export-speed-")))
         run = options.run or train(options, folder)
-        if run is None:
-            return
         setting = describe(run, options)
         measured = {what: measure(run, words, options.device, folder) for what, words in FORMATS.items()}
     question = f"All outputs of {setting['views']} evaluation views of {setting['size']} and {setting['bands']} bands"
@@ -61,16 +59,14 @@ def main(options: Options) -> None:
     _common.publish(report, _common.results_folder(options.results, options.quick))
 
 
-def train(options: Options, folder: Path) -> Path | None:
-    """A run of the scene; None if there is no scene."""
+def train(options: Options, folder: Path) -> Path:
+    """A run of the scene."""
     scene, seconds = options.scene, options.max_seconds
     if options.quick:
         scene, seconds = folder / "scene", 2.0
         script = _common.console_script("unmix-demo-scene")
         _common.run_command([script, str(scene), "--size", "32", "--bands", "8", "--views", "8"])
-    if not (scene / "transforms.json").is_file():
-        print(f"no scene at {scene}; name one with --scene, or a run with --run")
-        return None
+    _common.require_data(scene / "transforms.json", "the scene (--scene), or a run (--run)")
     words = ["--data", str(scene), "--output-dir", str(folder / "outputs"), "--device", options.device]
     script = _common.console_script("unmix-train")
     return _common.run_command([script, "unmix-nerf", *words, "--max-seconds", f"{seconds:g}"]).run

@@ -40,6 +40,7 @@ class Options:
 
 def main(options: Options) -> None:
     """Train on each number of views and publish."""
+    _common.require_data(options.scene / "transforms.json", "the scene (--scene)")
     machine, measured = _machine.describe_machine("cpu"), {}
     steps = 10 if options.quick else options.steps
     content = json.loads((options.scene / "transforms.json").read_text(encoding="utf-8"))

@@ -81,6 +81,8 @@ class Options:
 
 def main(options: Options) -> None:
     """Train what is missing, score, publish."""
+    for name in () if options.only_existing else options.only:
+        _common.require_data(options.scenes / name / "transforms.json", f"the scene {name} (--scenes)")
     measured: dict[str, dict[str, list[dict[str, float]]]] = {}
     with ExitStack() as stack:
         runs = options.runs or Path(

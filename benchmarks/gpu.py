@@ -63,8 +63,10 @@ def main(options: Options) -> None:
     try:
         resolve_device(options.device)
     except ConfigError as error:
-        print(f"nothing measured: {error}")
-        return
+        print(f"nothing measured: {error}", file=sys.stderr)
+        raise SystemExit(2) from error
+    if "still-life" not in options.leave_out:
+        _common.require_data(options.scenes / "still-life", "the scene still-life (--scenes, --leave-out)")
     figures, measured = [run_tests()], {}
     with TemporaryDirectory(prefix="unmix-gpu-") as folder:
         for name, part in parts(Path(folder), options).items():
@@ -103,10 +105,9 @@ def run_tests() -> _common.Figure:
 def parts(work: Path, options: Options) -> dict[str, Callable[[], tuple[_common.Figure, Any]]]:
     """What is measured after the tests, by name; the last one looks at what the one before trained."""
     still_life, large = options.scenes / "still-life", work / "large"
-    found = {"operators": partial(time_operators, work, options)}
-    if still_life.is_dir():
-        found["still-life"] = partial(train, still_life, work, 20, 7, STILL_LIFE, options)
-    return found | {
+    return {
+        "operators": partial(time_operators, work, options),
+        "still-life": partial(train, still_life, work, 20, 7, STILL_LIFE, options),
         "large scene": partial(train, large, work, 30, 6, LARGE_SCENE, options),
         "viewer": partial(frame_rate, work, options.device),
     }

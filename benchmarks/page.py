@@ -14,6 +14,7 @@ from __future__ import annotations
 import base64
 import io
 import shutil
+import sys
 import tempfile
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -74,8 +75,11 @@ def main(options: Options) -> None:
     machine = _machine.describe_machine()
     chromium = shutil.which("chromium") or shutil.which("chromium-browser")
     if chromium is None:
-        print("nothing measured: needs the program chromium")
-        return
+        print(
+            "nothing measured: needs the program chromium (scripts/install_system_packages.sh)",
+            file=sys.stderr,
+        )
+        raise SystemExit(2)
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="unmix-page-")))
         session = stack.enter_context(sync_playwright())
@@ -97,12 +101,15 @@ def main(options: Options) -> None:
 def trained(options: Options, folder: Path) -> list[Path]:
     """A run of each scene."""
     scenes = [("unmix-nerf", SCENES / name) for name in ("still-life", "vnir-pots")]
-    jobs = [job for job in scenes if job[1].is_dir()] + [("neumatex", Path("demo-object"))]
+    jobs = [*scenes, ("neumatex", Path("demo-object"))]
     seconds = options.max_seconds
     if options.quick:
         script = _common.console_script("unmix-demo-scene")
         _common.run_command([script, str(folder / "scene"), "--size", "32", "--bands", "8", "--views", "8"])
         jobs, seconds = [("unmix-nerf", folder / "scene")], 2.0
+    for _, scene in jobs if not options.quick else ():
+        if scene.name != "demo-object":
+            _common.require_data(scene / "transforms.json", f"the scene {scene.name}")
     script = _common.console_script("unmix-train")
     rest = ["--output-dir", str(folder / "outputs"), "--max-seconds", f"{seconds:g}"]
     return [_common.run_command([script, method, "--data", str(data), *rest]).run for method, data in jobs]

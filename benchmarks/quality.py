@@ -81,10 +81,9 @@ def main(options: Options) -> None:
     folders = sorted(path.parent for path in options.scenes.glob("*/transforms.json"))
     folders = [path for path in folders if not options.only or path.name in options.only]
     if not folders:
-        print(
-            f"no scene to measure: {options.scenes} has no folder with a transforms.json that was asked for"
+        _common.require_data(
+            options.scenes / "*/transforms.json", "every scene that was asked for (--scenes, --only)"
         )
-        return
     machine = _machine.describe_machine(options.device)
     seconds = 3.0 if options.quick else options.max_seconds
     setting = {

@@ -138,12 +138,14 @@ def scene_folders(scenes: Path, only: tuple[str, ...]) -> list[Path]:
     """Folders of the scenes to measure.
 
     Raises:
-        SystemExit: there is none.
+        SystemExit: there is none; with status 2.
     """
     folders = [path.parent for path in sorted(scenes.glob("*/transforms.json"))]
     folders = [path for path in folders if not only or path.name in only]
     if not folders:
-        raise SystemExit(f"no scene of such a name in {scenes}; say with --scenes where scene folders are")
+        _common.require_data(
+            scenes / "*/transforms.json", "every scene that was asked for (--scenes, --only)"
+        )
     return folders
 
 

@@ -1,0 +1,70 @@
+"""Results that pages cite: each names the clean revision that it was measured at, and what it depends on is known."""
+
+import importlib.util
+import subprocess
+import sys
+
+import pytest
+
+from tests.docs.pages import ROOT
+
+
+def module_of(path):
+    """A script of the repository."""
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+DEPENDS = module_of(ROOT / "benchmarks/_depends.py")
+CHECK = module_of(ROOT / "scripts/check_results.py")
+TO_MEASURE_AGAIN = {
+    "confidence": "python benchmarks/confidence.py",
+    "export_speed": "python benchmarks/export_speed.py",
+    "found_poses": "python benchmarks/found_poses.py --folder DIR",
+    "gpu": "python benchmarks/gpu.py",
+    "neumatex_prior": "python benchmarks/neumatex_prior.py",
+    "quality": "python benchmarks/quality.py",
+    "unmixing_2d-samson": "python benchmarks/unmixing_2d.py samson_dataset.mat --endmembers 3 --seeds 5 --json",
+    "viewer": "python benchmarks/viewer.py",
+}
+"""Results that are not clean, each with the command that measures it again. No other may join them."""
+
+
+@pytest.mark.parametrize("result", CHECK.cited_results())
+def test_a_cited_result_is_of_a_clean_revision(result):
+    fault = CHECK.fault_of(result)
+    assert (fault is not None) == (result in TO_MEASURE_AGAIN), fault
+
+
+def test_results_to_measure_again_are_still_cited():
+    assert set(TO_MEASURE_AGAIN) <= set(CHECK.cited_results())
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "benchmarks").glob("[a-z]*.py")), ids=lambda path: path.stem)
+def test_every_benchmark_states_what_it_measures(path):
+    if path.stem != "scenes":  # it makes what others measure
+        assert DEPENDS.DEPENDS_ON[path.stem]
+        assert all((ROOT / part).exists() for part in DEPENDS.measured_by(path.stem))
+
+
+def test_every_result_is_of_a_benchmark_that_is_here():
+    stems = {path.stem for path in (ROOT / "benchmarks/results").glob("*.md")} - {"tried"}
+    assert {DEPENDS.benchmark_of(stem) for stem in stems} <= set(DEPENDS.DEPENDS_ON)
+
+
+@pytest.mark.parametrize("name", ["quality", "unmixing", "editing", "few_views", "captures_training"])
+def test_a_benchmark_without_its_data_ends_with_2_and_says_what_makes_them(name, tmp_path):
+    option = {"editing": "--scene", "few_views": "--scene", "captures_training": "--shared"}.get(
+        name, "--scenes"
+    )
+    words = [sys.executable, ROOT / f"benchmarks/{name}.py", option, tmp_path / "nothing"]
+    ended = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert ended.returncode == 2, ended.stderr
+    assert "is missing" in ended.stderr
+    assert (
+        "real-captures.md" if name == "captures_training" else "python benchmarks/scenes.py"
+    ) in ended.stderr
