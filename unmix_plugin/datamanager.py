@@ -24,6 +24,7 @@ from unmix_plugin.engine.model import DataManager, TrainingCallback, TrainingCal
 from unmix_plugin.light.search import find_lamp
 from unmix_plugin.poses.knots import Knots
 from unmix_plugin.presets import choose, preset_for
+from unmix_plugin.scenes.doctor import check_masks
 from unmix_plugin.scenes.evidence import (
     AlphaEvidence,
     band_weights,
@@ -32,7 +33,7 @@ from unmix_plugin.scenes.evidence import (
     relative_power,
     rig_warnings,
 )
-from unmix_plugin.scenes.geometry.carving import Cells, Masks, carve, mask_warning, share_explained
+from unmix_plugin.scenes.geometry.carving import Cells, Masks, carve, share_contradicted, share_explained
 from unmix_plugin.scenes.geometry.lighting import judge_exposure, judge_light
 from unmix_plugin.scenes.geometry.matched_points import find_matched_points
 from unmix_plugin.scenes.geometry.surface_evidence import SurfaceEvidence
@@ -288,7 +289,9 @@ class HyperspectralDataManager(DataManager):
             foreground is None or self.scene.is_unbounded or self.scene.has_backdrop
         ):  # which was tried by that
             return hull, None
-        return hull, mask_warning(self.scene, foreground)
+        found = check_masks(share_contradicted(self.train_cameras, foreground, self.scene_box))
+        advice = "Poses may be off by some pixels (--poses refine corrects them), or masks have holes"
+        return hull, None if found is None else found.sentence(advice)
 
     @property
     def _foreground(self) -> Masks | None:

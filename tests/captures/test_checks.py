@@ -65,6 +65,7 @@ FAULTS = {
     "blur": (lambda folder: recorded(folder, view_0={"detail": 0.4}), BLUR),
     "saturated": (lambda folder: recorded(folder, view_0={"saturated_pixels": 2000}), "view_0"),
     "missing": (lambda folder: recorded(folder, view_1={"missing_pixels": 2000}), "view_1"),
+    "a wall in parts": (lambda folder: with_a_wall(folder), "contradict each other"),
     "empty": (lambda folder: recorded(folder, view_2={"matter_share": 0.0}), "view_2"),
 }
 
@@ -73,6 +74,16 @@ def recorded(folder, **facts: dict[str, float]):
     """Good views whose records say something else."""
     views = _views(folder, ring_of(20))
     return [replace(view, record=record_of(view.name, **facts.get(view.name, {}))) for view in views]
+
+
+def with_a_wall(folder):
+    """Good views, every third of which has kept a part of the wall behind the ball."""
+    views = _views(folder, ring_of(20))
+    for view in views[::3]:
+        pixels = np.array(Image.open(view.picture))
+        pixels[: SIDE // 3, : SIDE // 3] = (90, 90, 90, 255)
+        Image.fromarray(pixels).save(view.picture)
+    return views
 
 
 @pytest.mark.parametrize("kind", FAULTS)

@@ -23,7 +23,9 @@ from jaxtyping import Bool, Float32, Float64
 from unmix_plugin.captures.poses.pose_set import PosedCamera
 from unmix_plugin.captures.writing.view_files import ViewRecord
 from unmix_plugin.engine.geometry.camera_paths import meeting_point
+from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.errors import counted, name_some
+from unmix_plugin.scenes.doctor import check_masks, contradicted_share
 from unmix_plugin.spectral.colour.srgb import decode_srgb
 
 _FEW_VIEWS = 15
@@ -130,7 +132,9 @@ def check_views(views: Sequence[SeenView], points: _Points | None, findings: lis
             f"only {len(views)} views: expect holes and fog; {_FEW_VIEWS} or more all around serve better"
         )
     _pixels(views, findings)
-    return [check(views, points, findings) for check in (_ring, _overlap, _blur, _exposure, _moving_light)]
+    return [
+        check(views, points, findings) for check in (_ring, _overlap, _blur, _exposure, _moving_light, _masks)
+    ]
 
 
 def angles_between(views: Sequence[SeenView]) -> Float64[np.ndarray, "N N"]:
@@ -330,3 +334,42 @@ def _slope(first: SeenView, second: SeenView, points: _Points) -> float | None:
     angle = float(np.arccos(np.clip(first.axis @ second.axis, -1.0, 1.0)))
     slope = np.polyfit((along - middle) / radius, ratio[good], 1)[0]
     return float(slope / angle)
+
+
+_LONGEST_MASK_PX, _MOST_MASKS = 160, 60
+"""Pixels of a mask along its longer side, and masks, that are compared."""
+
+
+def _masks(views: Sequence[SeenView], _: _Points | None, findings: list[str]) -> str:
+    """Whether what masks show is there for the other views: a wall that is cut out as backdrop in some views and not
+    in others is not."""
+    import torch
+    from PIL import Image
+
+    chosen = np.unique(np.linspace(0, len(views) - 1, min(len(views), _MOST_MASKS)).round().astype(int))
+    some = [views[index] for index in chosen.tolist()]
+    lenses = [view.camera.lens for view in some if view.camera.lens is not None]
+    if len(some) < _LEAST_VIEWS or all(view.record.matter_share == 1.0 for view in some):
+        return "masks are not compared: there are too few views, or none has a mask"
+    shown, numbers, sizes = [], [], []
+    for view, lens in zip(some, lenses, strict=True):
+        with Image.open(view.picture) as picture:
+            scale = min(1.0, _LONGEST_MASK_PX / max(picture.size))
+            size = (max(1, round(scale * picture.width)), max(1, round(scale * picture.height)))
+            opacity = picture.convert("RGBA").getchannel("A").resize(size, Image.Resampling.BOX)
+        shown.append(np.asarray(opacity) > 127)
+        shrunk = np.array(size) / (lens.width, lens.height)
+        center = np.array(lens.center_px) * shrunk
+        numbers.append([*(np.array(lens.focal_px) * shrunk), *center, *lens.distortion, *lens.higher_radial])
+        sizes.append(size)
+    poses = torch.from_numpy(np.stack([view.camera.camera_to_world for view in some])).float()
+    focal, center, distortion = torch.tensor(np.array(numbers), dtype=torch.float32).split((2, 2, 6), dim=1)
+    share = contradicted_share(Cameras.of_sizes(poses, focal, center, distortion, sizes), shown)[1]
+    if (found := check_masks(share)) is not None:
+        findings.append(
+            found.sentence(
+                "Look at contact-sheet.png: walls or ground may be cut out as a backdrop in parts (--mask none keeps "
+                "everything), or poses are off"
+            )
+        )
+    return f"behind {share:.1%} of what masks show, masks of other views have only background"

@@ -13,6 +13,7 @@ from tests.scenes.scene_factory import ball_alpha, cameras_of, look_at, make_sce
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import rotation_matrix
 from unmix_plugin.scenes.demo.scene import make_demo_scene
+from unmix_plugin.scenes.doctor import Code, check_masks
 from unmix_plugin.scenes.evidence import AlphaEvidence
 from unmix_plugin.scenes.geometry import carving
 from unmix_plugin.scenes.geometry.bounds import find_bounds
@@ -232,9 +233,12 @@ def turned(scene: Scene, size: float) -> Scene:
 @pytest.mark.parametrize(("turn", "is_told"), [(0.0, False), (0.002, False), (0.1, True)])
 def test_poses_that_are_off_by_several_pixels_are_told_and_right_ones_raise_no_alarm(demo, turn, is_told):
     alphas = [demo.alpha(index) for index in demo.train_indices]
-    warning = carving.mask_warning(turned(demo, turn), [alpha > 0 for alpha in alphas if alpha is not None])
-    assert (warning is not None) == is_told
-    assert warning is None or ("contradict each other" in warning and "--poses refine" in warning)
+    scene = turned(demo, turn)
+    foreground = [alpha > 0 for alpha in alphas if alpha is not None]
+    cameras = scene.cameras[list(scene.train_indices)]
+    found = check_masks(carving.share_contradicted(cameras, foreground, scene.scene_box))
+    assert (None if found is None else found.code) == (Code.MASKS_CONTRADICT if is_told else None)
+    assert found is None or found.share > 0.05
 
 
 def test_a_point_on_the_right_or_lower_edge_of_an_image_is_outside_as_everywhere():

@@ -380,18 +380,3 @@ def share_contradicted(cameras: Cameras, foreground: Masks, box: SceneBox) -> fl
     `MOST_CONTRADICTED` where poses and masks are right."""
     rays = foreground_rays(cameras, [_without_specks(mask) for mask in foreground])
     return 1 - share_through(rays, box, carve_box(cameras, foreground, box, _WITNESS_CELLS))
-
-
-def mask_warning(scene: Scene, foreground: Masks) -> str | None:
-    """What to say of masks that look through what others show; None if none do. For bounded scenes with alpha.
-
-    They do where poses are off by more than a few pixels, and where masks err.
-    """
-    share = share_contradicted(scene.cameras[list(scene.train_indices)], foreground, scene.scene_box)
-    if share <= MOST_CONTRADICTED:
-        return None
-    return (
-        f"the masks of the training views contradict each other: behind {share:.1%} of what they show, other views "
-        f"see only background (expected at most {MOST_CONTRADICTED:.0%}). Poses may be off by some pixels "
-        "(--poses refine corrects them), or masks have holes"
-    )

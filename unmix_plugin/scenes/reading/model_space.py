@@ -18,8 +18,9 @@ from unmix_plugin.engine.geometry.key_poses import KeyPoses
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes.backdrops import BeforeBackdrop, find_before_backdrop
+from unmix_plugin.scenes.doctor import check_masks, contradicted_share
 from unmix_plugin.scenes.geometry.bounds import find_bounds
-from unmix_plugin.scenes.geometry.carving import MOST_CONTRADICTED, share_contradicted
+from unmix_plugin.scenes.geometry.carving import MOST_CONTRADICTED
 from unmix_plugin.scenes.geometry.matched_points import find_matched_points
 from unmix_plugin.scenes.geometry.view_agreement import compare_conventions, describe, find_world_evidence
 from unmix_plugin.scenes.geometry.views import Views, commonest
@@ -145,15 +146,11 @@ def _judge_backdrop(views: Views) -> _JudgedBackdrop:
     before = find_before_backdrop(views)
     if before is None:
         return _JudgedBackdrop(decision=Decision("backdrop", "none", {}, "", "--world"))
-    box, contradicted, masks = None, 0.0, before.masks()
+    box, contradicted = None, 0.0
     if before.shows_matter:
-        try:
-            box = find_bounds(views.cameras, masks)
-            contradicted = share_contradicted(views.cameras, masks, box)
-        except SceneError:  # poses contradict it
-            contradicted = 1.0
+        box, contradicted = contradicted_share(views.cameras, before.masks())
     tried = f"masks from it contradict each other behind more than {MOST_CONTRADICTED:.0%} of what they show"
-    is_refuted = contradicted > MOST_CONTRADICTED
+    is_refuted = check_masks(contradicted) is not None
     evidence = {"looks": before.in_words, "contradicted": contradicted}
     decision = Decision("backdrop", "none" if is_refuted else "found", evidence, tried, "--world")
     if is_refuted:
