@@ -8,13 +8,12 @@ from PIL import Image
 from scipy import ndimage
 
 from tests.scenes.scene_factory import look_at
-from unmix_plugin.captures.match_checks import MatchedView, check_matches
+from unmix_plugin.captures.match_checks import MatchedScene, MatchedView, check_matches, views_of_other_poses
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.pose_set import PosedCamera
 
 SIZE, FOCAL, VIEWS = 200, 100.0, 6
 LENS = Lens(SIZE, SIZE, (FOCAL, FOCAL), (SIZE / 2, SIZE / 2))
-ANGLES = 10.0 * np.abs(np.subtract.outer(np.arange(VIEWS), np.arange(VIEWS)))
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +61,11 @@ def make_views(folder: Path, straighten, texture: np.ndarray) -> list[MatchedVie
 def checked(views: list[MatchedView]) -> tuple[str, list[str]]:
     """What is said, and what is found wrong."""
     found: list[str] = []
-    return check_matches(views, ANGLES, found), found
+    return check_matches(matched(views), found), found
+
+
+def matched(views: list[MatchedView]) -> MatchedScene:
+    return MatchedScene.of([f"v{index}" for index in range(len(views))], views)
 
 
 @pytest.mark.slow
@@ -97,3 +100,27 @@ def test_views_without_features_are_not_judged(tmp_path, size):
     said, found = checked(plain)
     assert "too few views share features" in said
     assert found == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("spoilt", [0, 2, 5])
+def test_a_view_with_the_pose_of_another_one_is_named_and_no_other(pinhole_views, spoilt):
+    assert views_of_other_poses(matched(pinhole_views)) == {}
+    views = list(pinhole_views)
+    views[spoilt] = views[(spoilt + 3) % VIEWS][0], views[spoilt][1]
+    scene = matched(views)
+    found = views_of_other_poses(scene)
+    assert list(found) == [f"v{spoilt}"]
+    wrong: list[str] = []
+    check_matches(scene.without(found), wrong)
+    assert wrong == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pattern", ["checks", "stripes"])
+def test_patterns_that_repeat_do_not_call_true_poses_wrong(tmp_path, pattern):
+    rows, columns = np.indices((600, 600)) // 24
+    texture = ((rows + columns) % 2 if pattern == "checks" else columns % 2) + 0.05 * bumps()
+    views = make_views(tmp_path, lambda bent: bent, texture)
+    assert views_of_other_poses(matched(views)) == {}
+    assert checked(views)[1] == []

@@ -16,8 +16,8 @@ Source: features as in Lowe 2004, Distinctive image features from scale-invarian
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeAlias
 
@@ -26,11 +26,12 @@ from jaxtyping import Float64, Int
 
 from unmix_plugin.captures.poses.lens import Lens, Points
 from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera
+from unmix_plugin.captures.report import Code, Remark
 
 _LONGEST_SIDE_PX = 320
 """Of pictures in which features are found."""
 _MOST_FEATURES = 500
-_STARS, _AROUND = 4, 5
+_STARS, _AROUND = 40, 5
 """Views that are compared with others, and how many around each."""
 _ANGLES_DEG = (3.0, 30.0)
 """Between the axes of a view and those around it."""
@@ -57,10 +58,23 @@ _LEAST_MOVED_PX = 2.0
 """What another lens must move the corners of the picture by, the same pixels."""
 _POSES_OFF_PX = 4.0
 """Distance left with any lens, from which poses are said to be wrong."""
+_FITS_PX, _MOST_FITTING = 1.5, 0.35
+"""Distance at which a point fits, and their share with which poses can't be wrong, whatever the others do."""
+_LEAST_LIKE = 0.8
+"""Difference of a match over that between a feature and the one most like it in its own picture."""
+_SAME_PLACE_PX = 3.0
+"""Features of one place, which are alike."""
+_TIMES_USUAL_MISS, _LEAST_TRACKS, _MOST_OTHER_POSES = 4.0, 10, 0.25
+"""Distance of a view's points over the usual one, points by which a view is judged, and share of views, with which some
+are said to have other poses."""
 
 
 MatchedView: TypeAlias = tuple[PosedCamera, Path]
 """A camera, with the lens of its picture, and where this lies."""
+_Features: TypeAlias = tuple[Float64[np.ndarray, "F 2"], np.ndarray]
+"""Places in pixels of the picture, and descriptors."""
+_Pairs: TypeAlias = dict[tuple[int, int], tuple[Int[np.ndarray, " M"], Int[np.ndarray, " M"]]]
+"""Indices of features that match, by the indices of two views."""
 
 
 @dataclass(frozen=True)
@@ -73,39 +87,165 @@ class _Star:
     positions: Float64[np.ndarray, "V 3"]
     focal_px: float
     """Pixels of the picture in which features are found."""
+    views: tuple[int, ...] = ()
+    """Indices of the views, the one in the middle first."""
 
-    def misses_px(self, lens: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "T V 2"]:
-        """From where each point is seen to where its place in space would be, with a lens that has been changed."""
-        ideal = _changed(self.ideal.reshape(-1, 2), lens).reshape(self.ideal.shape)
+    def without(self, views: Collection[int]) -> _Star:
+        """The points that enough of the other views show."""
+        kept = [index not in views for index in self.views]
+        ideal = self.ideal[:, kept]
+        shown = np.isfinite(ideal[..., 0])
+        ideal = ideal[shown[:, 0] & (shown.sum(axis=1) >= _LEAST_VIEWS)]
+        left = tuple(index for index in self.views if index not in views)
+        return replace(
+            self, ideal=ideal, rotations=self.rotations[kept], positions=self.positions[kept], views=left
+        )
+
+    def centre_miss_px(self) -> float:
+        """From where the view in the middle shows points to where the others place them, median; NaN with few."""
+        if len(self.ideal) < _LEAST_TRACKS:
+            return float("nan")
+        away = self.ideal[:, 0]
+        around = self.ideal.copy()
+        around[:, 0] = np.nan
+        others = replace(self, ideal=around)
+        places = others.places(around)
+        before = (places - self.positions[0]) @ self.rotations[0]
+        found = before[:, :2] / np.maximum(before[:, 2:], 1e-6)
+        return self.focal_px * float(np.median(np.linalg.norm(np.clip(found - away, -1.0, 1.0), axis=1)))
+
+    def places(self, ideal: Float64[np.ndarray, "T V 2"]) -> Float64[np.ndarray, "T 3"]:
+        """Where the rays of points meet."""
         rays = np.concatenate([ideal, np.ones_like(ideal[..., :1])], axis=-1)
         rays = np.einsum("vij,tvj->tvi", self.rotations, rays / np.linalg.norm(rays, axis=-1, keepdims=True))
         seen = np.isfinite(rays[..., :1, None])
         across = np.where(seen, np.eye(3) - rays[..., :, None] * rays[..., None, :], 0.0)  # off each ray
         total = across.sum(axis=1) + 1e-9 * np.eye(3)
-        places = np.linalg.solve(total, np.einsum("tvij,vj->ti", across, self.positions)[..., None])[..., 0]
+        return np.linalg.solve(total, np.einsum("tvij,vj->ti", across, self.positions)[..., None])[..., 0]
+
+    def misses_px(self, lens: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "T V 2"]:
+        """From where each point is seen to where its place in space would be, with a lens that has been changed."""
+        ideal = _changed(self.ideal.reshape(-1, 2), lens).reshape(self.ideal.shape)
+        places = self.places(ideal)
         before = np.einsum("vji,tvj->tvi", self.rotations, places[:, None] - self.positions)
         found = before[..., :2] / np.maximum(before[..., 2:], 1e-6)
         return self.focal_px * np.exp(lens[0]) * np.clip(found - ideal, -1.0, 1.0)
 
 
-def check_matches(
-    views: Sequence[MatchedView], angles_deg: Float64[np.ndarray, "N N"], findings: list[str]
-) -> str:
-    """What was measured in the views of one sensor; what does not fit is appended to findings.
+@dataclass(frozen=True)
+class MatchedScene:
+    """Points that views share, found once."""
 
-    Args:
-        angles_deg: Between their optical axes.
-    """
-    chosen = _choose_stars(angles_deg)
-    used = sorted({index for star in chosen for index in star})
-    features = {index: _features_of(views[index][1]) for index in used}
-    cameras = [camera for camera, _ in views]
-    found = [_find_star([cameras[i] for i in star], [features[i] for i in star]) for star in chosen]
-    stars = [star for star in found if star is not None]
-    lens = cameras[0].lens
-    if lens is None or sum(len(star.ideal) for star in stars) < _LEAST_POINTS:
+    names: tuple[str, ...]
+    stars: tuple[_Star, ...]
+    lens: Lens | None
+    """Of the first view."""
+    cameras: tuple[PosedCamera, ...] = ()
+    features: Mapping[int, _Features | None] = field(default_factory=dict, repr=False)
+    """Of the views that are compared."""
+
+    @staticmethod
+    def of(names: Sequence[str], views: Sequence[MatchedView]) -> MatchedScene:
+        """Match the features of near views of one sensor."""
+        axes = np.stack([-camera.camera_to_world[:, 2] for camera, _ in views])
+        angles_deg = np.degrees(np.arccos(np.clip(axes @ axes.T, -1.0, 1.0)))
+        chosen = _choose_stars(angles_deg)
+        used = sorted({index for star in chosen for index in star})
+        features = {index: _features_of(views[index][1]) for index in used}
+        cameras = [camera for camera, _ in views]
+        pairs: _Pairs = {}
+        found = [_find_star(star, cameras, features, pairs) for star in chosen]
+        stars = tuple(star for star in found if star is not None)
+        return MatchedScene(tuple(names), stars, cameras[0].lens, tuple(cameras), features)
+
+    def without(self, views: Collection[str]) -> MatchedScene:
+        """The points that the other views share."""
+        gone = [index for index, name in enumerate(self.names) if name in views]
+        left = [star.without(gone) for star in self.stars if star.views[0] not in gone]
+        features = {index: own for index, own in self.features.items() if index not in gone}
+        return replace(self, stars=tuple(star for star in left if len(star.ideal)), features=features)
+
+
+def views_of_other_poses(scene: MatchedScene) -> dict[str, Remark]:
+    """Views whose pictures do not fit their poses, while those of the others do."""
+    found = _misplaced(scene)
+    found |= _among_strangers(scene.without(found))
+    return found if len(found) <= _MOST_OTHER_POSES * len(scene.names) else {}
+
+
+def _among_strangers(scene: MatchedScene) -> dict[str, Remark]:
+    """Views that share nothing with those around them, by their poses, but with others, which the poses do not fit."""
+    tracks = {star.views[0]: len(star.ideal) for star in scene.stars}
+    if len(tracks) < _LEAST_VIEWS or np.median([*tracks.values()]) < _LEAST_TRACKS:
+        return {}
+    known = {view for view, count in tracks.items() if count >= _LEAST_TRACKS}
+    usual = float(np.nanmedian([star.centre_miss_px() for star in scene.stars]))
+    found: dict[str, Remark] = {}
+    for view in sorted(scene.features.keys() - known):
+        own = scene.features[view]
+        if own is None:
+            continue
+        misses = []
+        for other in sorted(known):
+            theirs = scene.features[other]
+            assert theirs is not None
+            pairs = _matches(own, theirs, _shrunk(scene.lens))
+            if len(pairs[0]) > 2 * _LEAST_MATCHES:
+                seen = (own[0][pairs[0]], theirs[0][pairs[1]])
+                misses.append(_off_epipolar_lines_px(seen, scene.cameras[view], scene.cameras[other]))
+        if len(misses) >= _LEAST_VIEWS - 1 and min(misses) > _POSES_OFF_PX:
+            shrunk = _shrunk(scene.lens)
+            pixels = {"miss_px": float(np.median(misses)) / shrunk, "usual_px": usual / shrunk}
+            found[scene.names[view]] = Remark.of(Code.VIEW_OF_OTHER_POSE, [scene.names[view]], **pixels)
+    return found
+
+
+def _off_epipolar_lines_px(seen: tuple[Points, Points], one: PosedCamera, other: PosedCamera) -> float:
+    """Median distance of points of one view from the epipolar lines of the other, by the poses, in pixels of the
+    picture in which features are found."""
+    assert one.lens is not None
+    assert other.lens is not None
+    ideal = [lens.ideal_of(pixels) for lens, pixels in zip((one.lens, other.lens), seen, strict=True)]
+    if ideal[0] is None or ideal[1] is None:
+        return float("nan")
+    first, second = (np.column_stack([points, np.ones(len(points))]) for points in (ideal[0], ideal[1]))
+    turns = [camera.camera_to_world[:, :3] @ FLIP for camera in (one, other)]
+    moved = turns[0].T @ (other.camera_to_world[:, 3] - one.camera_to_world[:, 3])
+    lines = np.cross(moved, second @ (turns[0].T @ turns[1]).T)
+    away = np.abs((lines * first).sum(axis=1)) / np.maximum(np.linalg.norm(lines[:, :2], axis=1), 1e-12)
+    return float(np.median(away)) * _shrunk(one.lens) * float(np.mean(one.lens.focal_px))
+
+
+def _misplaced(scene: MatchedScene) -> dict[str, Remark]:
+    """Views that show points elsewhere than where the others place them; the worst first."""
+    found: dict[str, Remark] = {}
+    shrunk = _shrunk(scene.lens)
+    most = int(_MOST_OTHER_POSES * len(scene.names))
+    while len(found) <= most:
+        scene = scene.without(found)
+        misses = {star.views[0]: star.centre_miss_px() for star in scene.stars}
+        misses = {view: miss for view, miss in misses.items() if np.isfinite(miss)}
+        if len(misses) < _LEAST_VIEWS + 1:
+            return found
+        worst, usual = max(misses, key=lambda view: misses[view]), float(np.median([*misses.values()]))
+        if misses[worst] < max(_POSES_OFF_PX, _TIMES_USUAL_MISS * usual):
+            return found
+        pixels = {"miss_px": misses[worst] / shrunk, "usual_px": usual / shrunk}
+        name = scene.names[worst]
+        found[name] = Remark.of(Code.VIEW_OF_OTHER_POSE, [name], **pixels)
+    return {}
+
+
+def check_matches(scene: MatchedScene, findings: list[str]) -> str:
+    """What was measured in the views of one sensor; what does not fit is appended to findings."""
+    if scene.lens is None or sum(len(star.ideal) for star in scene.stars) < _LEAST_POINTS:
         return "poses and lens are not compared with matched points: too few views share features"
-    return _judge(stars, lens, findings)
+    return _judge(scene.stars, scene.lens, findings)
+
+
+def _shrunk(lens: Lens | None) -> float:
+    """Scale of the picture in which features are found."""
+    return 1.0 if lens is None else min(1.0, _LONGEST_SIDE_PX / max(lens.width, lens.height))
 
 
 def _judge(stars: Sequence[_Star], lens: Lens, findings: list[str]) -> str:
@@ -118,7 +258,10 @@ def _judge(stars: Sequence[_Star], lens: Lens, findings: list[str]) -> str:
     def most(values: np.ndarray) -> float:
         return float(np.percentile(np.linalg.norm(misses(values), axis=1), _PERCENTILE))
 
-    shrunk = min(1.0, _LONGEST_SIDE_PX / max(lens.width, lens.height))
+    def fitting(values: np.ndarray) -> float:
+        return float(np.mean(np.linalg.norm(misses(values), axis=1) < _FITS_PX))
+
+    shrunk = _shrunk(lens)
     given = np.zeros(3)
     start = most(given)
     best = least_squares(
@@ -144,7 +287,7 @@ def _judge(stars: Sequence[_Star], lens: Lens, findings: list[str]) -> str:
             f"{np.exp(best[0]):.0%} and radial terms that move the corners by {moved:.0f} px: is the lens of another "
             "model (a fisheye), or given for pictures of another size or crop?"
         )
-    elif left > _POSES_OFF_PX:
+    elif left > _POSES_OFF_PX and fitting(best) < _MOST_FITTING:
         findings.append(
             f"the pictures do not fit their poses: {said}, and no lens brings them below {left / shrunk:.2f} px: are "
             "the poses those of these pictures, and in the convention that their file is read with?"
@@ -194,18 +337,28 @@ def _features_of(picture: Path) -> tuple[Points, np.ndarray] | None:
 
 
 def _find_star(
-    cameras: Sequence[PosedCamera], features: Sequence[tuple[np.ndarray, np.ndarray] | None]
+    views: Sequence[int],
+    all_cameras: Sequence[PosedCamera],
+    features: Mapping[int, _Features | None],
+    pairs: _Pairs,
 ) -> _Star | None:
-    """Points of the first view that enough of the others show; None without any."""
-    first, lenses = features[0], [camera.lens for camera in cameras]
+    """Points of the first view that enough of the others show; None without any. Matches are remembered in `pairs`."""
+    cameras = [all_cameras[index] for index in views]
+    first, lenses = features[views[0]], [camera.lens for camera in cameras]
     if first is None or lenses[0] is None:
         return None
     pixels = np.full((len(first[0]), len(cameras), 2), np.nan)
     pixels[:, 0] = first[0]
-    shrunk = min(1.0, _LONGEST_SIDE_PX / max(lenses[0].width, lenses[0].height))
-    for index, other in enumerate(features[1:], start=1):
+    for index, view in enumerate(views[1:], start=1):
+        other = features[view]
         if other is not None:
-            mine, theirs = _matches(first, other, shrunk)
+            low, high = sorted((views[0], view))
+            if (low, high) not in pairs:
+                one, two = features[low], features[high]
+                assert one is not None
+                assert two is not None
+                pairs[low, high] = _matches(one, two, _shrunk(lenses[0]))
+            mine, theirs = pairs[low, high] if low == views[0] else pairs[low, high][::-1]
             pixels[mine, index] = other[0][theirs]
     pixels = pixels[np.isfinite(pixels[..., 0]).sum(axis=1) >= _LEAST_VIEWS]
     ideal = np.full_like(pixels, np.nan)
@@ -219,7 +372,8 @@ def _find_star(
     if not len(ideal):
         return None
     poses = np.stack([camera.camera_to_world for camera in cameras])
-    return _Star(ideal, poses[:, :, :3] @ FLIP, poses[:, :, 3], shrunk * float(np.mean(lenses[0].focal_px)))
+    focal_px = _shrunk(lenses[0]) * float(np.mean(lenses[0].focal_px))
+    return _Star(ideal, poses[:, :, :3] @ FLIP, poses[:, :, 3], focal_px, tuple(views))
 
 
 def _nearest_in_own_view(features: tuple[Points, np.ndarray]) -> Float64[np.ndarray, " P"]:
@@ -231,8 +385,18 @@ def _nearest_in_own_view(features: tuple[Points, np.ndarray]) -> Float64[np.ndar
     return np.sqrt(np.where(same, np.inf, np.maximum(differences, 0)).min(axis=1))
 
 
+def _is_unlike_others(features: _Features, shrunk: float) -> Float64[np.ndarray, " F"]:
+    """How unlike each feature is what is most like it elsewhere in its own picture."""
+    from scipy.spatial.distance import cdist
+
+    places, descriptors = features
+    unlike = cdist(descriptors, descriptors)
+    unlike[cdist(places, places) * shrunk < _SAME_PLACE_PX] = np.inf
+    return unlike.min(axis=1)
+
+
 def _matches(
-    one: tuple[Points, np.ndarray], other: tuple[Float64[np.ndarray, "Q 2"], np.ndarray], shrunk: float
+    one: _Features, other: _Features, shrunk: float
 ) -> tuple[Int[np.ndarray, " M"], Int[np.ndarray, " M"]]:
     """Indices of features of two views that match and that a fundamental matrix explains; none if those are few."""
     from skimage.feature import match_descriptors
@@ -249,6 +413,9 @@ def _matches(
         apart = np.linalg.norm(one[1][found[:, 0]].astype(float) - other[1][found[:, 1]], axis=1)
         repeated = np.minimum(alone[0][found[:, 0]], alone[1][found[:, 1]])
         found = found[apart < _MOST_REPEATED * repeated]
+        unlike = [_is_unlike_others(each, shrunk)[found[:, side]] for side, each in enumerate((one, other))]
+        apart = np.linalg.norm(one[1][found[:, 0]].astype(float) - other[1][found[:, 1]], axis=1)
+        found = found[apart < _LEAST_LIKE * np.minimum(*unlike)]
         if len(found) < _LEAST_MATCHES:
             return none, none
         _, explained = ransac(

@@ -175,9 +175,7 @@ def make_plan(
     tables = filter(os.path.isfile, texts)
     warned = sentences(remarks, Kind.WRONG)
     warned += _doubts_of_values([*sensors.values()], 1.0 if options.scale is not None else scale)
-    kinds = {(one.is_absolute, one.is_stated): one.unit for one in sensors.values()}
-    if len(kinds) > 1 and not any(is_srgb(view.cube) for view in views):
-        warned += sentences([Remark.of(Code.UNLIKE_MEANINGS, kinds=[*kinds.values()])], Kind.WRONG)
+    warned += sentences(_doubts_of_meaning(options, mask, views, [*sensors.values()]), Kind.WRONG)
     end = min(sensor.saturated_from for sensor in sensors.values())
     if end < _LEAST_END * scale:
         warned.append(
@@ -234,6 +232,17 @@ def _with_one_exposure(sensors: dict[str, Sensor], first: dict[str, SpectralFile
     one = brought[first_name]
     brought[first_name] = replace(one, remarks=(*one.remarks, *remarks))
     return brought
+
+
+def _doubts_of_meaning(
+    options: ProcessOptions, mask: MaskKind, views: Sequence[CaptureView], sensors: Sequence[Sensor]
+) -> Iterator[Remark]:
+    """A mask that was looked for and not found, and sensors whose values are of different kinds."""
+    if options.mask == "auto" and mask == "none" and not any(view.release for view in views):
+        yield Remark.of(Code.NO_MASK_FOUND)
+    kinds = {(one.is_absolute, one.is_stated): one.unit for one in sensors}
+    if len(kinds) > 1 and not any(is_srgb(view.cube) for view in views):
+        yield Remark.of(Code.UNLIKE_MEANINGS, kinds=[*kinds.values()])
 
 
 def _doubts_of_values(sensors: Sequence[Sensor], found_scale: float) -> Iterator[str]:

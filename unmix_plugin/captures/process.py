@@ -15,14 +15,17 @@ import numpy as np
 
 from unmix_plugin.captures.calibration.references import require_comparable
 from unmix_plugin.captures.finding_poses import check_pose_options, marked_poses, poses_of_written_views
+from unmix_plugin.captures.match_checks import views_of_other_poses
 from unmix_plugin.captures.options import LAYOUTS, ProcessOptions, find_views
 from unmix_plugin.captures.plan import Plan, hashes, input_files, make_plan
 from unmix_plugin.captures.poses.estimation import WORK_FILES
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.pose_set import PosedCamera
 from unmix_plugin.captures.posing import (
+    ESTIMATE,
     FROM_PICTURES,
     MARKERS,
+    TURNTABLE,
     PosedViews,
     asked_distance,
     given_poses,
@@ -39,7 +42,7 @@ from unmix_plugin.captures.spectral_file import (
 from unmix_plugin.captures.spoilt import UnreadableViews, judge_sharpness
 from unmix_plugin.captures.wavelengths import parse_wavelengths
 from unmix_plugin.captures.writing.resampling import Resampling
-from unmix_plugin.captures.writing.scene_files import RECORD_NAME, write_scene_files
+from unmix_plugin.captures.writing.scene_files import RECORD_NAME, match_views, seen_views, write_scene_files
 from unmix_plugin.captures.writing.view_files import ViewRecord, write_view
 from unmix_plugin.engine.runs.atomic_files import make_folder, write_errors_as, write_file
 from unmix_plugin.engine.runs.replacing import (
@@ -123,7 +126,13 @@ def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list
     for note in posed.notes:
         say(f"poses: {note}")
     posed = replace(posed, views=tuple(_without(posed.views, left_out)))
-    findings = write_scene_files(folder.path, plan, posed, records, options, [*left_out.values()])
+    matched = match_views(seen_views(folder.path, plan, posed, records))
+    if options.poses not in (ESTIMATE, TURNTABLE):  # which the pictures themselves decide
+        others = views_of_other_poses(matched)
+        left_out |= {name: remark for name, remark in others.items() if name not in options.keep_view}
+        posed = replace(posed, views=tuple(_without(posed.views, left_out)))
+        matched = matched.without(left_out)
+    findings = write_scene_files(folder.path, plan, posed, records, options, matched, [*left_out.values()])
     return [*findings, *folder.finish(options.overwrite)]
 
 

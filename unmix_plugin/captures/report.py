@@ -71,6 +71,13 @@ class Code(Enum):
     VIEW_UNREADABLE = _wrong("{where} is left out, as its file can't be read: {why}")
     VIEW_NOT_WANTED = _done("{where} is left out, as --leave-out says")
 
+    # Masks.
+    NO_MASK_FOUND = _wrong(
+        "no mask: files have no alpha channel and no backdrop was found that all views share, so that all of each "
+        "picture is taken for the scene; right for rooms and landscapes (--mask none), otherwise give --mask white, "
+        "black or files"
+    )
+
     # Exposures.
     EXPOSURE_COUNTED_BEFORE = _done(
         "views were exposed {exposed} {unit}: values are not divided by that, as {source} says that they are "
@@ -93,7 +100,7 @@ class Code(Enum):
         "by a factor"
     )
     DARK_EXPOSED_OTHERWISE = _wrong(
-        "the dark frame was exposed {of_dark} s times gain, what it is subtracted from {of_others}: dark current "
+        "the dark frame was exposed {of_dark} {unit}, what it is subtracted from {of_others}: dark current "
         "grows with exposure, so take a dark frame at each"
     )
     EXPOSURES_OF_PICTURES = _wrong(

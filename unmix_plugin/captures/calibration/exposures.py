@@ -19,10 +19,6 @@ from unmix_plugin.captures.calibration.references import finished_by
 from unmix_plugin.captures.report import Code, Remark
 from unmix_plugin.captures.spectral_file import SpectralFile
 
-_LIGHT = "s times gain over the square of the f-number"
-_CURRENT = "s times gain"
-"""What is counted: of light, and where no file states an f-number."""
-
 
 def exposure_of(file: SpectralFile, to_light: bool = True) -> Float64[np.ndarray, " b"] | None:
     """Exposure time times gain, and over the square of the f-number if that is known, one number or one a band; None
@@ -80,8 +76,7 @@ class ExposedFiles:
     @property
     def said(self) -> dict[str, str]:
         """The exposures of the views, for sentences."""
-        has_aperture = any("f_number" in file.metadata for file in self.stating)
-        return {"exposed": _range(self.known), "unit": _LIGHT if has_aperture else _CURRENT}
+        return {"exposed": _range(self.known), "unit": _unit(self.stating)}
 
     def lacking(self, factor: str) -> list[SpectralFile]:
         """Files without a factor of the exposure that others of those with a time state."""
@@ -152,7 +147,14 @@ def _unlike_darks(darks: Sequence[tuple[SpectralFile, SpectralFile]]) -> list[Re
     if not unlike:
         return []
     of_darks, of_others = (_range(exposures) for exposures in zip(*unlike, strict=True))
-    return [Remark.of(Code.DARK_EXPOSED_OTHERWISE, of_dark=of_darks, of_others=of_others)]
+    unit = _unit([file for pair in darks for file in pair], to_light=False)
+    return [Remark.of(Code.DARK_EXPOSED_OTHERWISE, of_dark=of_darks, of_others=of_others, unit=unit)]
+
+
+def _unit(files: Sequence[SpectralFile], to_light: bool = True) -> str:
+    """What is counted: only that which some file states."""
+    gain, aperture = (any(name in file.metadata for file in files) for name in ("gain", "f_number"))
+    return f"s{' times gain' * gain}{' over the square of the f-number' * (aperture and to_light)}"
 
 
 def _range(exposures: Iterable[Float64[np.ndarray, " _"]]) -> str:

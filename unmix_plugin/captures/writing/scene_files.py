@@ -20,7 +20,7 @@ from jaxtyping import Float64, UInt8
 from unmix_plugin import __version__
 from unmix_plugin.captures.calibration.sensor import Sensor
 from unmix_plugin.captures.checks import SeenView, angles_between, check_views
-from unmix_plugin.captures.match_checks import check_matches
+from unmix_plugin.captures.match_checks import MatchedScene, check_matches
 from unmix_plugin.captures.options import ProcessOptions, plain_options
 from unmix_plugin.captures.plan import Plan, hashes
 from unmix_plugin.captures.poses.pose_set import PoseSet
@@ -46,18 +46,47 @@ _MOST_BANDS = 8
 """Bands left out for one reason that are named."""
 
 
+def seen_views(
+    folder: Path, plan: Plan, posed: PosedViews, records: Mapping[str, ViewRecord]
+) -> list[SeenView]:
+    """The views that have poses and are written, with the lenses of their pictures."""
+    seen = []
+    for view in posed.views:
+        if view.name in records:
+            record, camera = records[view.name], posed.poses.cameras[view.name]
+            assert camera.lens is not None
+            lens = plan.sensors[view.sensor].calibration.raster.lens(camera.lens)
+            seen.append(SeenView(record, replace(camera, lens=lens), folder / record.paths["file_path"]))
+    return seen
+
+
+def match_views(seen: Sequence[SeenView]) -> MatchedScene:
+    """What the views share of the sensor that took the most."""
+    greatest = _greatest_sensor(seen)
+    same = [view for view in seen if view.record.sensor == greatest]
+    return MatchedScene.of([view.name for view in same], [(view.camera, view.picture) for view in same])
+
+
+def _greatest_sensor(seen: Sequence[SeenView]) -> str:
+    """The sensor that took the most views."""
+    ((greatest, _),) = Counter(view.record.sensor for view in seen).most_common(1)
+    return greatest
+
+
 def write_scene_files(
     folder: Path,
     plan: Plan,
     posed: PosedViews,
     records: dict[str, ViewRecord],
     options: ProcessOptions,
+    matched: MatchedScene,
     left_out: Sequence[Remark] = (),
 ) -> list[str]:
     """Write transforms.json, light, points, contact sheet, report and record.
 
     Args:
         records: Of the views that are written, with some that are left out.
+        matched: What the views share that are not left out, of the sensor that took the most.
         left_out: Why views are left out, one each.
     Returns:
         What looks wrong, one sentence each.
@@ -65,14 +94,9 @@ def write_scene_files(
         RunError: the folder can't be written.
     """
     keys = posed.keys | _write_points(folder, posed.poses) | _write_light(folder, plan)
-    seen = []
-    for view in posed.views:
-        record, camera = records[view.name], posed.poses.cameras[view.name]
-        assert camera.lens is not None
-        lens = plan.sensors[view.sensor].calibration.raster.lens(camera.lens)
-        seen.append(SeenView(record, replace(camera, lens=lens), folder / record.paths["file_path"]))
+    seen = seen_views(folder, plan, posed, records)
     # Views of sensors with other bands can't be compared with those of the one that took the most.
-    ((greatest, _),) = Counter(view.record.sensor for view in seen).most_common(1)
+    greatest = _greatest_sensor(seen)
     alike = {name for name, sensor in plan.sensors.items() if _has_bands_of(sensor, plan.sensors[greatest])}
     findings = sentences(left_out, Kind.WRONG)
     findings += dict.fromkeys((*plan.warnings, *posed.poses.warnings))
@@ -83,8 +107,7 @@ def write_scene_files(
         same = [view for view in seen if view.record.sensor == name]
         samples = [ViewSample.of(view.record, folder) for view in same]
         check_values(samples, angles_between(same), sensor.centers_nm, findings)
-    same = [view for view in seen if view.record.sensor == greatest]
-    measured.append(check_matches([(v.camera, v.picture) for v in same], angles_between(same), findings))
+    measured.append(check_matches(matched, findings))
     title = f"{plan.capture.root}: {len(seen)} views, {_sizes_in_words(plan)}"
     done = sentences(left_out, Kind.DONE) + _what_was_done(plan, posed, [view.record for view in seen])
     reasons = {remark.where[0]: remark for remark in left_out}
