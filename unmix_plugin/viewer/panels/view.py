@@ -293,6 +293,8 @@ class ScenePanel:
                 fov=pose.fov,
                 aspect=pose.aspect,
                 scale=size,
+                thickness=2.0,
+                thickness_units="screen",
                 color=_TRAIN_COLOUR if is_train else _EVAL_COLOUR,
                 wxyz=pose.wxyz,
                 position=pose.position,
@@ -330,7 +332,9 @@ class ScenePanel:
         edges = [(i, i | 1 << axis) for axis in range(3) for i in range(8) if not i & 1 << axis]
         points = np.array([[corners[start], corners[end]] for start, end in edges], dtype=np.float32)
         scene = self._session.client.scene
-        return [scene.add_line_segments("/box", points, colors=(120, 120, 120))]
+        return [
+            scene.add_line_segments("/box", points, (120, 120, 120), thickness=2.0, thickness_units="screen")
+        ]
 
     def _add_points(self) -> list[viser.PointCloudHandle]:
         """Surface points of the materials that are visible, in the colours that these have now; every n-th where there
