@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 import torch
 
+from tests.commands.running import run
 from tests.systems import SIGNALS_TO_END, needs_posix
 from unmix_plugin.commands.entry import run_command
 from unmix_plugin.errors import ConfigError, SceneError, UnmixWarning
@@ -229,3 +230,33 @@ def test_help_imports_nothing_that_it_does_not_need(command, words, heavy):
     first, second, rest = ended.stdout.split(b"end: 0 []\n")
     assert min(len(first), len(second)) > 200
     assert rest == b""
+
+
+@needs_posix
+def test_pipes_and_devices_are_refused_before_anything_waits_for_them(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    for words in ([tmp_path / "pipe"], [f"--mask={tmp_path / 'pipe'}"], ["--data", "/dev/zero"]):
+        ended = run(lambda _: None, *words)
+        assert ended.status == 2
+        assert "is a pipe, a socket or a device; give a regular file" in ended.err
+
+
+def test_what_a_full_device_or_a_limit_refuses_is_said_with_place_and_advice():
+    def fail(error):
+        def command(_):
+            raise error
+
+        return run(command)
+
+    ended = fail(OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
+    assert ended.status == 2
+    assert "standard output, or a file that was open: No space left on device; make room" in ended.err
+    ended = fail(OSError(errno.EFBIG, os.strerror(errno.EFBIG), "out.bin"))
+    assert "out.bin: File too large; raise the limit" in ended.err
+    for error in (
+        ImportError("libtorch.so: failed to map segment from shared object"),
+        RuntimeError("can't start new thread"),
+        OSError(errno.ENOMEM, os.strerror(errno.ENOMEM)),
+    ):
+        ended = fail(error)
+        assert (ended.status, ended.err.startswith("error: out of memory")) == (2, True)

@@ -1,22 +1,47 @@
 """What several processes that train one model owe each other; what keeps them from it is said once, by the first."""
 
 import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 import torch
 from torch import distributed
 
 from tests.engine.process_worker import STEPS, config_for, fixed_batch
-from unmix_plugin.engine.processes import ALONE, Follower, Processes, _run_processes, joined
+from tests.systems import needs_posix
+from unmix_plugin.engine import processes
+from unmix_plugin.engine.processes import (
+    ALONE,
+    Follower,
+    Processes,
+    _run_processes,
+    joined,
+    start_together,
+)
 from unmix_plugin.engine.training.steps import prepare_steps
 from unmix_plugin.engine.training.trainer import Trainer
-from unmix_plugin.errors import ConfigError
+from unmix_plugin.errors import ConfigError, RunError
+
+ROOT = Path(__file__).resolve().parents[2]
+SECOND_OF_TWO = {
+    "RANK": 1,
+    "WORLD_SIZE": 2,
+    "LOCAL_RANK": 1,
+    "LOCAL_WORLD_SIZE": 2,
+    "MASTER_ADDR": "127.0.0.1",
+    "MASTER_PORT": 29500,
+}
 
 
 @pytest.fixture
 def second_of_two(monkeypatch):
     """The environment of the second process of two on one machine that has two GPUs."""
-    for name, value in {"RANK": 1, "WORLD_SIZE": 2, "LOCAL_RANK": 1, "LOCAL_WORLD_SIZE": 2}.items():
+    for name, value in SECOND_OF_TWO.items():
         monkeypatch.setenv(name, str(value))
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     monkeypatch.setattr(torch.cuda, "set_device", lambda _: None)
@@ -54,11 +79,13 @@ MODULE = "tests.engine.process_worker"
 
 
 @pytest.fixture
-def run(tmp_path, capfd):
+def run(tmp_path, capfd, monkeypatch):
     """Runs an action in two processes: exit code, standard error and what each process kept.
 
     None may leave threads of the group behind, which can abort a process when Python ends.
     """
+
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))  # where these tests are
 
     def run_action(action):
         code = _run_processes(MODULE, [str(tmp_path), action], 2)
@@ -136,3 +163,93 @@ def test_alone_nothing_is_exchanged():
     assert ALONE.gather("word") == ["word"]
     assert ALONE.announce(0.5) == 0.5
     assert ALONE.of_first(ALONE.reduce(values, "mean")).tolist() == [1.0, 2.0]
+
+
+@pytest.mark.parametrize(
+    ("variables", "message"),
+    [
+        ({"WORLD_SIZE": ""}, "WORLD_SIZE is '' in the environment; expected a number"),
+        ({"WORLD_SIZE": "two"}, "WORLD_SIZE is 'two'"),
+        ({"WORLD_SIZE": "0"}, "WORLD_SIZE is '0'"),
+        ({"WORLD_SIZE": "2"}, "RANK and MASTER_ADDR and MASTER_PORT are not set"),
+        ({"MASTER_ADDR": None}, "but MASTER_ADDR is not set"),
+        ({"MASTER_PORT": "many"}, "MASTER_PORT is 'many'"),
+        ({"RANK": "2"}, "RANK is '2' in the environment; expected a number from 0 to 1"),
+        ({"LOCAL_RANK": "-1"}, "LOCAL_RANK is '-1'"),
+    ],
+)
+def test_half_of_a_clusters_environment_is_refused_by_name(monkeypatch, variables, message):
+    for name, value in SECOND_OF_TWO.items():
+        if len(variables) == 1 and "WORLD_SIZE" in variables:
+            monkeypatch.delenv(name, raising=False)
+        else:
+            monkeypatch.setenv(name, str(value))
+    for name, value in variables.items():
+        monkeypatch.delenv(name) if value is None else monkeypatch.setenv(name, value)
+    with pytest.raises(ConfigError, match=message), joined("cpu"):
+        pass
+    with pytest.raises(ConfigError, match=message):
+        start_together("none", [], 2)
+
+
+WAITING = """
+import os, sys
+from unmix_plugin.commands.entry import run_command
+from unmix_plugin.engine.processes import joined
+def wait(_):
+    with joined("cpu"):
+        pass
+run_command(wait)
+"""
+
+
+def waiting(rank, port, address="127.0.0.1"):
+    told = {"WORLD_SIZE": 2, "RANK": rank, "MASTER_ADDR": address, "MASTER_PORT": port}
+    environment = {**os.environ, **{name: str(value) for name, value in told.items()}}
+    return subprocess.Popen(
+        [sys.executable, "-c", WAITING], env=environment, stderr=subprocess.PIPE, text=True
+    )
+
+
+def free_port():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@needs_posix
+@pytest.mark.parametrize("rank", [0, 1])
+def test_a_process_that_waits_for_others_says_so_and_ends_on_signals(rank):
+    process = waiting(rank, free_port())
+    line = process.stderr.readline()
+    assert line.startswith("waiting for "), line
+    assert "at most 10 minutes" in line
+    process.send_signal(signal.SIGTERM)
+    process.communicate(timeout=10)
+    assert process.returncode == 128 + signal.SIGTERM
+
+
+def test_processes_that_never_come_are_not_waited_for_without_end(second_of_two):
+    second_of_two.setattr(processes, "_MEETING_S", 0.2)
+    second_of_two.setenv("MASTER_PORT", str(free_port()))
+    with pytest.raises(RunError, match="have all of them been started"), joined("cpu"):
+        pass
+
+
+@needs_posix
+def test_the_store_listens_on_this_machine_alone_unless_a_clusters_address_is_given():
+    own = socket.gethostbyname(socket.gethostname())
+    for address, is_open in (("127.0.0.1", False), (own, True)):
+        port = free_port()
+        process = waiting(0, port, address)
+        try:
+            said = process.stderr.readline()
+            assert ("open to all who reach that network" in said) == (is_open and not own.startswith("127."))
+            with socket.create_connection((address, port), timeout=5):
+                pass
+            if not is_open and not own.startswith("127."):
+                with pytest.raises(ConnectionRefusedError):
+                    socket.create_connection((own, port), timeout=5)
+        finally:
+            process.kill()
+            process.communicate()

@@ -10,12 +10,15 @@ import codecs
 import errno
 import io
 import logging
+import math
 import os
 import re
 import select
 import signal
+import stat
 import sys
 import threading
+import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -24,7 +27,7 @@ from types import FrameType
 from typing import Any, NoReturn
 
 from unmix_plugin.engine.printing import tell, terminal_text
-from unmix_plugin.errors import UnmixError, UnmixWarning
+from unmix_plugin.errors import ConfigError, UnmixError, UnmixWarning
 
 DONE, INTERNAL_ERROR, USER_ERROR, INTERRUPTED, BROKEN_PIPE = 0, 1, 2, 130, 141
 
@@ -40,9 +43,10 @@ _MACHINE_ERRORS = frozenset(
 or leads in a circle, and what is no file or no folder."""
 
 _OUT_OF_MEMORY = re.compile(
-    r"OutOfMemoryError|DefaultCPUAllocator|Failed to allocate|CUDA error: out of memory"
+    r"OutOfMemoryError|DefaultCPUAllocator|Failed to allocate|CUDA error: out of memory|bad_alloc|"
+    r"failed to map segment|[Cc]annot allocate memory|can't start new thread|Resource temporarily unavailable"
 )
-"""What torch and Warp say, whose errors are RuntimeErrors."""
+"""What torch, Warp, the system's loader of libraries and Python say, of which few are MemoryErrors."""
 
 _MEMORY_ADVICE = (
     "Close other programs; use fewer, smaller or more coarsely binned images; lower "
@@ -63,10 +67,11 @@ def run_command(command: Callable[[list[str]], object], arguments: Sequence[str]
     """
     argv = [_at_home(word) for word in (sys.argv[1:] if arguments is None else arguments)]
     is_debug = "--debug" in argv
-    interrupts: list[int] = []
+    signals: list[int] = []
     try:
         _ready_streams()
-        with _signals_as_exits(interrupts), _libraries_in_short():
+        with _signals_as_exits(signals), _libraries_in_short():
+            _refuse_odd_files(argv)
             command([argument for argument in argv if argument != "--debug"])
             sys.stdout.flush()
     except KeyboardInterrupt:
@@ -75,11 +80,24 @@ def run_command(command: Callable[[list[str]], object], arguments: Sequence[str]
     except Exception as error:  # noqa: BLE001 - the one border where any error becomes an exit code
         if isinstance(error, OSError) and _is_output_closed(error):
             sys.exit(BROKEN_PIPE)
-        # An import in C can lose the KeyboardInterrupt and go on without what it was about to import.
-        message, status = ("interrupted", INTERRUPTED) if interrupts else _verdict(error)
+        # Wherever C code loses what a handler raises, it may go on without what it was about to do.
+        message, status = ("interrupted", 128 + signals[0]) if signals else _verdict(error)
         _say(message, is_debug)
         sys.exit(status)
-    sys.exit(DONE)
+    sys.exit(128 + signals[0] if signals else DONE)
+
+
+def _refuse_odd_files(argv: Sequence[str]) -> None:
+    """Refuse pipes, sockets and devices among the arguments: who opens one may wait for ever. Raises ConfigError."""
+    for path in (part for word in argv for part in (word, word.partition("=")[2]) if part):
+        try:
+            mode = os.stat(path).st_mode  # noqa: PTH116 - words that are no path at all, too
+        except (OSError, ValueError):
+            continue
+        if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+            raise ConfigError(
+                f"{path} is a pipe, a socket or a device; give a regular file, such as a copy of it"
+            )
 
 
 def _at_home(word: str) -> str:
@@ -143,16 +161,32 @@ def _libraries_in_short() -> Iterator[None]:
 
 
 @contextmanager
-def _signals_as_exits(interrupts: list[int]) -> Iterator[None]:
-    """Context in which SIGTERM and SIGHUP raise SystemExit, so that whatever was begun is cleaned up; `interrupts` gets
-    the number of each SIGINT, which raises KeyboardInterrupt as it always does."""
+def _signals_as_exits(noted: list[int]) -> Iterator[None]:
+    """Context in which Ctrl-C raises KeyboardInterrupt, and SIGTERM and SIGHUP raise SystemExit, so that whatever was
+    begun is cleaned up; `noted` gets the number of each signal.
 
-    def leave(number: int, _frame: FrameType | None) -> NoReturn:
-        sys.exit(128 + number)
+    While a module is imported nothing is raised, but at once when that is done: imports made by C code lose exceptions,
+    and what they were to import is missing afterwards.
+    """
+    raised_at = -math.inf
 
-    def interrupt(number: int, _frame: FrameType | None) -> NoReturn:
-        interrupts.append(number)
-        raise KeyboardInterrupt
+    def stop(number: int, frame: FrameType | None) -> None:
+        nonlocal raised_at
+        noted.append(number)
+        if (waiting := _frame_outside(frame)) is not frame and waiting is not None:
+
+            def trace(*_: Any) -> None:
+                sys.settrace(None)
+                waiting.f_trace = None
+                stop(number, waiting)
+
+            waiting.f_trace = trace  # called with the next line of the frame that waits for the import
+            sys.settrace(lambda *_: None)
+        elif time.monotonic() - raised_at > _SAME_SIGNAL_S:  # not one that came by two ways
+            raised_at = time.monotonic()
+            if number == signal.SIGINT:
+                raise KeyboardInterrupt
+            sys.exit(128 + number)
 
     usual = {"SIGTERM": signal.SIG_DFL, "SIGHUP": signal.SIG_DFL, "SIGINT": signal.default_int_handler}
     before: dict[int, Any] = {}
@@ -160,13 +194,29 @@ def _signals_as_exits(interrupts: list[int]) -> Iterator[None]:
         for name, handler in usual.items():
             number = getattr(signal, name, None)
             # One that is ignored stays so, as under nohup.
-            if number is not None and signal.getsignal(number) is handler:
-                before[number] = signal.signal(number, interrupt if name == "SIGINT" else leave)
+            if number is not None and signal.getsignal(number) in (handler, signal.SIG_DFL):
+                before[number] = signal.signal(number, stop)
     try:
         yield
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+_SAME_SIGNAL_S = 0.3
+"""Within which two signals are one that a terminal and another process sent."""
+
+
+def _frame_outside(frame: FrameType | None) -> FrameType | None:
+    """The innermost frame in which what a handler raises can't get lost: outside of imports, and of what Python calls
+    to destroy an object."""
+    outside = frame
+    while frame is not None:
+        code = frame.f_code
+        if code.co_filename.startswith("<frozen importlib") or code.co_name == "__del__":
+            outside = frame.f_back
+        frame = frame.f_back
+    return outside
 
 
 def _is_output_closed(error: OSError) -> bool:
@@ -190,11 +240,17 @@ def _is_output_closed(error: OSError) -> bool:
 def _verdict(error: Exception) -> tuple[str, int]:
     """What to say about an error, and the exit code."""
     text = f"{type(error).__name__}: {error}"
-    is_of_machine = isinstance(error, OSError) and error.errno in _MACHINE_ERRORS
     is_loop = isinstance(error, RuntimeError) and "Symlink loop" in text  # so Python says it before 3.13
-    if isinstance(error, UnmixError) or is_of_machine or is_loop:
+    if isinstance(error, UnmixError) or is_loop:
         return f"error: {error}", USER_ERROR
-    if isinstance(error, MemoryError) or _OUT_OF_MEMORY.search(text):
+    if isinstance(error, OSError) and error.errno in _MACHINE_ERRORS:
+        from unmix_plugin.engine.runs.atomic_files import ADVICE
+
+        where = error.filename or "standard output, or a file that was open"
+        advice = f"; {ADVICE[error.errno]}" if error.errno in ADVICE else ""
+        return f"error: {where}: {error.strerror or error}{advice}", USER_ERROR
+    is_of_memory = isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM
+    if is_of_memory or _OUT_OF_MEMORY.search(text):
         reason = str(error).strip().splitlines() or ["no more to be had"]
         return f"error: out of memory: {reason[0]}. {_MEMORY_ADVICE}", USER_ERROR
     return f"this is a bug in unmix-nerf, please report it with what --debug shows: {text}", INTERNAL_ERROR

@@ -1,4 +1,10 @@
-"""The console scripts. They import their commands, which takes seconds, where Ctrl-C is already looked after."""
+"""The console scripts. They import their commands, which takes seconds, where signals are already looked after."""
+
+import signal
+
+# Until then Ctrl-C ends the process at once, as other signals do: there is nothing to clean up.
+if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 from functools import partial
 from importlib import import_module

@@ -27,6 +27,7 @@ from jaxtyping import Bool, Shaped, UInt8
 from unmix_plugin.captures.names import natural_order
 from unmix_plugin.captures.poses.colmap import read_colmap
 from unmix_plugin.captures.poses.pose_set import PoseSet
+from unmix_plugin.engine.children import child_command
 from unmix_plugin.errors import CaptureError, install_hint, name_some
 
 _LEAST_VIEWS = 3
@@ -145,7 +146,7 @@ def _run(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
             return json.loads(result.read_text(encoding="utf-8"))
     result.unlink(missing_ok=True)
     asked.write_text(told, encoding="utf-8")
-    command = [sys.executable, "-m", "unmix_plugin.captures.poses.estimation", str(asked)]
+    command = child_command("unmix_plugin.captures.poses.estimation", [str(asked)])
     with (folder / _LOG).open("wb") as log:
         ran = subprocess.run(command, stdout=log, stderr=log, stdin=subprocess.DEVNULL, check=False)
     if ran.returncode != 0 or not result.is_file():

@@ -32,13 +32,13 @@ _CHUNK_BYTES = 1 << 26
 _LONGEST_PATH = 259 if os.name == "nt" else None
 """Letters of a path, where Windows has not been told to take long ones; its error is that of a missing folder."""
 
-_ADVICE = {
+ADVICE = {
     **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "make room or choose another folder"),
     **dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), "choose a folder that you may write to"),
     errno.EFBIG: "raise the limit of a file's size (ulimit -f), or choose a folder on another file system",
     errno.ENAMETOOLONG: "choose a shorter name",
 }
-_ADVICE_FOR = {os.strerror(number): f"; {advice}" for number, advice in _ADVICE.items()}
+_ADVICE_FOR = {os.strerror(number): f"; {advice}" for number, advice in ADVICE.items()}
 
 NOT_PLAIN, NOT_PORTABLE = r"[^\w.+-]+", r'[\\/:*?"<>|]'
 """What a name needn't have, and what some system refuses in one."""

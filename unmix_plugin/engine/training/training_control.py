@@ -220,19 +220,29 @@ class Interrupted(Exception):  # noqa: N818
         """Step of the newest checkpoint, from which `load_config(run)` resumes; None if there is none."""
 
 
+SAME_SIGNAL_S = 0.3
+"""Within which signals are one that came by two ways."""
+
+
 @contextmanager
 def stop_signals() -> Iterator[list[int]]:
     """Context in which Ctrl-C, SIGTERM or SIGHUP is only noted in the list, and a second one raises KeyboardInterrupt.
 
     A lost terminal often sends SIGHUP twice, so that a second one of these changes nothing; under nohup it stays
-    ignored. In a thread that is not the main one signals can't be caught, and nothing is ever noted.
+    ignored. Of Ctrl-C a terminal and the process that started this one may both tell, so that what comes at once counts
+    once. In a thread that is not the main one signals can't be caught, and nothing is ever noted.
     """
     noted: list[int] = []
+    noted_at = 0.0
 
     def note(number: int, _frame: FrameType | None) -> None:
-        if noted and signal.Signals(number).name != "SIGHUP":
+        nonlocal noted_at
+        is_second = bool(noted) and time.monotonic() - noted_at > SAME_SIGNAL_S
+        if is_second and signal.Signals(number).name != "SIGHUP":
             raise KeyboardInterrupt
-        noted.append(number)
+        if not noted:
+            noted.append(number)
+            noted_at = time.monotonic()
 
     from unmix_plugin.engine.machine import handled_signals  # which imports torch: help of commands must not
 

@@ -9,7 +9,6 @@ import os
 import re
 import signal
 import subprocess
-import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Sequence
@@ -20,6 +19,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
+from unmix_plugin.engine.children import child_command
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.formats.exr import write_spectral_exr
 from unmix_plugin.formats.video import OWN_GROUP
@@ -81,7 +81,6 @@ def write_spectra(path: Path, picture: Sequence[np.ndarray], materials: Material
     return write_spectral_exr(path, spectra, materials.bands, linear_rgb, coverage, about, materials.quantity)
 
 
-_LAUNCH = "from unmix_plugin.commands import scripts; scripts.render()"
 _LONGEST_MESSAGE, _LINES_KEPT = 1000, 100
 _WAIT_S = 10.0
 _PROGRESS = re.compile(r"rendering: (\d+) of ([1-9]\d*) done")
@@ -168,7 +167,7 @@ class VideoQueue:
 
 def _begin(argv: list[str]) -> subprocess.Popen[str]:
     return subprocess.Popen(
-        [sys.executable, "-c", _LAUNCH, *argv],
+        child_command("unmix_plugin.commands.render", argv),
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
