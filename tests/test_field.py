@@ -8,7 +8,7 @@ from torch.testing import assert_close
 
 from tests.method_factory import BOX, CONFIG
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.field import UnmixField, _cells_of_finest_level, _rows_of_level
+from unmix_plugin.field import UnmixField
 from unmix_plugin.light.shading import direction_features
 from unmix_plugin.settings import UnmixFieldConfig
 
@@ -114,8 +114,10 @@ def test_direction_features_are_orthogonal_over_the_sphere():
 
 
 def test_levels_have_more_rows_where_a_scene_is_many_pixels_large_unless_their_number_is_set():
+    edge = float(BOX.size.max())
+
     def rows(config):
-        return [_rows_of_level(config, _cells_of_finest_level(config, BOX, pixel)) for pixel in PIXELS]
+        return [config.settled(edge, pixel).log2_rows_per_level for pixel in PIXELS]
 
     sizes = rows(UnmixFieldConfig())
     assert (sizes[0], sizes[-1]) == (16, 19)
@@ -123,7 +125,7 @@ def test_levels_have_more_rows_where_a_scene_is_many_pixels_large_unless_their_n
     assert len(set(sizes)) == 4
     assert set(rows(UnmixFieldConfig(log2_rows_per_level=12))) == {12}
     fine = UnmixFieldConfig(cells_per_pixel=2.0)
-    assert [_cells_of_finest_level(fine, BOX, size) for size in (0.01, 0.04)] == [400, 100]
+    assert [fine.settled(edge, size).finest_resolution for size in (0.01, 0.04)] == [400, 100]
     for number in (3, 25):
         with pytest.raises(ConfigError, match="log2-rows-per-level of 4 to 24 or auto"):
             UnmixFieldConfig(log2_rows_per_level=number)

@@ -7,6 +7,7 @@ its area, so several rays are cast through it, one in each cell of a grid on it;
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -91,7 +92,12 @@ class HyperspectralDataManager(DataManager):
         self.train_cameras = self.scene.cameras[list(self.scene.train_indices)]
         self.eval_cameras = self.scene.cameras[list(self.scene.eval_indices)]
         self._rays = PixelRays(self.scene, device)
-        self._preset = preset_for(self.scene.has_alpha, self.scene.is_unbounded, self.scene.has_backdrop)
+        preset = preset_for(self.scene.has_alpha, self.scene.is_unbounded, self.scene.has_backdrop)
+        self.config = self.options = replace(
+            config,
+            subpixels=choose(config.subpixels, 1 if self._num_train_pixels > _MANY_PIXELS else 2),
+            single_ray_until=choose(config.single_ray_until, preset.single_ray_until),
+        )
         self._num_rays = config.train_num_rays_per_batch
         self._choose_subpixels(step=0, progress=0.0)
 
@@ -313,12 +319,12 @@ class HyperspectralDataManager(DataManager):
         return self._rays.shares(self._pixels.shares) if self.scene.is_rig else None
 
     def _choose_subpixels(self, step: int, progress: float) -> None:
-        until = choose(self.options.single_ray_until, self._preset.single_ray_until)
-        self._subpixels = 1 if progress < until else self._final_subpixels
+        is_coarse = progress < float(self.options.single_ray_until)
+        self._subpixels = 1 if is_coarse else self._final_subpixels
 
     @property
     def _final_subpixels(self) -> int:
-        return choose(self.options.subpixels, 1 if self._num_train_pixels > _MANY_PIXELS else 2)
+        return int(self.options.subpixels)
 
     @property
     def _num_train_pixels(self) -> int:

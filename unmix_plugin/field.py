@@ -35,12 +35,9 @@ from unmix_plugin.light.shading import (
     sky_features,
 )
 from unmix_plugin.operators.hash_encoding import HashGridLayout, hash_encode
-from unmix_plugin.presets import choose
-from unmix_plugin.settings import LARGEST_RESOLUTION, UnmixFieldConfig
+from unmix_plugin.settings import UnmixFieldConfig
 
 _LARGEST_LOG_DENSITY = 15.0
-_ROWS_PER_CELL_OF_A_FACE = 1 / 3
-_FEWEST_LOG2_ROWS, _MOST_LOG2_ROWS = 16, 19
 NUM_FEATURES = 15
 """Geometry features that the heads see."""
 _BRIGHTEST = 8.0
@@ -142,13 +139,13 @@ class UnmixField(CoefficientField):
         self.num_endmembers, self.num_specular = num_endmembers, num_specular
         self.num_encoded = config.num_levels * config.features_per_level
         self.log_initial_density = math.log(initial_density)
-        finest_resolution = _cells_of_finest_level(config, scene_box, pixel_size) * (2 if is_unbounded else 1)
+        sizes = config.settled(float(scene_box.size.max()), pixel_size, is_unbounded)
         self.layout = HashGridLayout(
             config.num_levels,
             config.features_per_level,
             config.coarsest_resolution,
-            finest_resolution,
-            _rows_of_level(config, finest_resolution),
+            int(sizes.finest_resolution) * (2 if is_unbounded else 1),
+            int(sizes.log2_rows_per_level),
         )
         self.register_buffer("aabb", scene_box.aabb.clone())
         self.is_unbounded = is_unbounded
@@ -262,20 +259,3 @@ class UnmixField(CoefficientField):
 def _bounded_exp(raw: Float[Tensor, "S"]) -> Float[Tensor, "S"]:
     """exp, clamped in value only: a point that grew too dense can still become less dense."""
     return (raw + (raw.clamp(max=_LARGEST_LOG_DENSITY) - raw).detach()).exp()
-
-
-def _cells_of_finest_level(config: UnmixFieldConfig, scene_box: SceneBox, pixel_size: float) -> int:
-    """Cells along the scene box's longest edge; `pixel_size` is as `UnmixField` takes it."""
-    wanted = math.ceil(config.cells_per_pixel * float(scene_box.size.max()) / pixel_size)
-    cells = choose(config.finest_resolution, min(wanted, LARGEST_RESOLUTION))
-    return max(config.coarsest_resolution, cells)
-
-
-def _rows_of_level(config: UnmixFieldConfig, finest_resolution: int) -> int:
-    """Log2 of the rows that a level may have, where the finest has so many cells along the longest edge.
-
-    A surface passes through as many cells as it has area, so the rows that large scenes need grow with the square of
-    their resolution; small ones would only learn more slowly with more rows.
-    """
-    wanted = round(math.log2(finest_resolution**2 * _ROWS_PER_CELL_OF_A_FACE))
-    return choose(config.log2_rows_per_level, max(_FEWEST_LOG2_ROWS, min(wanted, _MOST_LOG2_ROWS)))

@@ -47,7 +47,7 @@ from unmix_plugin.rendering.published_field import PublishedField
 from unmix_plugin.rendering.renderer import RenderedRays, VolumeRenderer
 from unmix_plugin.sensors.batches import MeasuredPixels, from_batch
 from unmix_plugin.sensors.views import BandBalance, SensorViews, ViewGains
-from unmix_plugin.settings import UnmixModelConfig
+from unmix_plugin.settings import COARSEST_REFINED, UnmixModelConfig
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.library.spectra_csv import write_spectra_csv
@@ -59,9 +59,6 @@ SAMPLES_ON_CPU, SAMPLES_ON_GPU = 25_000, 400_000
 _FEWEST_RAYS, _FEWEST_SAMPLES_A_RAY = 64, 3
 _FIRST_PART = 0.05
 """Part of the training in which lighter samples may have gradients than later."""
-_COARSEST_REFINED = 4
-"""Cells along the scene box on the coarsest level at most where poses are refined: a pose that is off by a cell still
-finds its way."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +83,8 @@ class UnmixModel(Model):
     def populate_modules(self) -> None:
         """Field, grid, endmembers (K, B) and specular spectra (J, B), shaped by config and metadata. Raises
         ConfigError: more endmembers than bands."""
-        config, metadata = self.config, self.metadata
+        self.longest_edge, metadata = float(self.scene_box.size.max()), self.metadata
+        config = self.config = self.config.settled(self.longest_edge, metadata)
         centers, widths = (metadata.get(key) for key in ("wavelengths_nm", "fwhm_nm"))
         self.bands = Bands(np.array(centers, float), None if widths is None else np.array(widths, float))
         self.is_unbounded = bool(metadata.get("is_unbounded", False))
@@ -94,17 +92,16 @@ class UnmixModel(Model):
         self.is_carved = metadata["has_alpha"] or self.has_backdrop
         """Whether pictures tell where nothing is."""
         self.preset = preset_for(metadata["has_alpha"], self.is_unbounded, self.has_backdrop)
-        self.num_endmembers = config.checked_num_endmembers(len(self.bands))
+        assert isinstance(config.num_endmembers, int)
+        self.num_endmembers = config.num_endmembers
         shape = (self.num_endmembers, len(self.bands))
         self.endmembers = nn.Parameter(torch.zeros(shape), requires_grad=config.train_endmembers)
         num_dictionary = config.num_dictionary_spectra(self.preset, self.num_endmembers)
         self.specular_spectra = nn.Parameter(torch.zeros(num_dictionary, len(self.bands)))
-        unknown = config.lamp in ("auto", ())
-        self._lamp = None if unknown else Lamp.of_numbers([float(x) for x in config.lamp])
+        self._lamp = Lamp.of_numbers([float(x) for x in config.lamp]) if config.lamp else None
         self.grid = self._new_grid(torch.ones((metadata["grid_resolution"],) * 3, dtype=torch.bool))
         self._renderer: VolumeRenderer | None = None
-        self.longest_edge = float(self.scene_box.size.max())
-        self.step = config.renderer.sample_distance(metadata["pixel_size"], self.longest_edge, self.is_carved)
+        self.step = metadata["pixel_size"] / float(config.renderer.samples_per_pixel)
         self.field = self._new_field()
         self.register_buffer("rgb_weights", rgb_matrix(self.bands), persistent=False)
         self.register_buffer("every_band", torch.eye(len(self.bands)), persistent=False)
@@ -118,7 +115,7 @@ class UnmixModel(Model):
             rows = metadata.get("line_rows") or [0] * metadata["num_train_views"]
             self.poses = PoseRefinement(rows, config.pose_refinement.lens)
         self.seen_by = SensorViews(metadata.get("sensors", ()), self.rgb_weights)
-        weights = () if config.losses.band_weights == "auto" else config.losses.band_weights
+        weights = tuple(float(weight) for weight in config.losses.band_weights)
         self.balance = BandBalance(weights, self.bands, self.seen_by)
         self.comparison = BatchComparison(
             config.losses,
@@ -135,12 +132,15 @@ class UnmixModel(Model):
         self._occupied_share = torch.ones(())
 
     def initialise(self, initial_data: Mapping[str, np.ndarray], generator: torch.Generator) -> None:
-        """Endmembers from the training pixels or a file, the light in the dictionary, and the carved grid.
+        """Samples a step of this machine, endmembers from the training pixels or a file, the light in the dictionary,
+        and the carved grid.
 
         Raises:
             SpectrumError: more endmembers than distinct pixels, or spectra that don't cover the bands.
             ConfigError: the file has another number of spectra than `num_endmembers`.
         """
+        usual = SAMPLES_ON_CPU if self.device.type == "cpu" else SAMPLES_ON_GPU
+        self.config = replace(self.config, samples_per_step=choose(self.config.samples_per_step, usual))
         light = self.metadata["illuminant"]
         lamp = torch.ones(len(self.bands)) if light is None else torch.tensor(light, dtype=torch.float32)
         endmembers = first_endmembers(
@@ -190,7 +190,7 @@ class UnmixModel(Model):
                 self.grid.skips,
                 self.grid.reachable,
                 self.step,
-                choose(config.renderer.smallest_weight, self.preset.smallest_weight),
+                float(config.renderer.smallest_weight),
                 self.is_unbounded,
                 config.losses.background == "last",
                 self.rays_per_chunk,
@@ -271,7 +271,7 @@ class UnmixModel(Model):
     def learn_from(self, step: TrainingBatch) -> None:
         """Note which cells the views see, and how far margins of abundances are from those of measured spectra."""
         rendered, views = step.rendered, step.corrected.rays.camera_indices
-        visible_weight = choose(self.config.renderer.visible_weight, self.preset.visible_weight)
+        visible_weight = float(self.config.renderer.visible_weight)
         if visible_weight < 1:
             own, is_seen = views.index_select(0, rendered.ray_indices), rendered.weights > visible_weight
             num_rays = len(views) * self.processes.count
@@ -357,25 +357,24 @@ class UnmixModel(Model):
     @property
     def _training_renderer(self) -> VolumeRenderer:
         """That of the present training step: samples may be farther apart, and shadows softer, than in the end."""
-        preset, progress = self.preset, self._progress
-        is_first = progress < _FIRST_PART
-        smallest = preset.first_smallest_weight if is_first else preset.smallest_weight
+        config, progress = self.config.renderer, self._progress
+        smallest = config.first_smallest_weight if progress < _FIRST_PART else config.smallest_weight
         return replace(
             self.renderer,
             step=self.step * self._coarseness(progress),
-            smallest_weight=choose(self.config.renderer.smallest_weight, smallest),
+            smallest_weight=float(smallest),
             shadow_detail=ShadowDetail.at(progress),
         )
 
     def _coarseness(self, progress: float) -> float:
         """How many times farther apart samples are in training than in the end: large images begin coarsely."""
-        return self.config.renderer.coarseness(self.longest_edge / self.step, self.preset, progress)
+        return self.config.renderer.coarseness(self.longest_edge / self.step, progress)
 
     def _new_field(self) -> CoefficientField:
-        config, opacity = self.config, choose(self.config.initial_opacity, self.preset.initial_opacity)
+        config, opacity = self.config, float(self.config.initial_opacity)
         field, refines = config.field, config.poses == "refine"
         if refines:
-            field = replace(field, coarsest_resolution=min(field.coarsest_resolution, _COARSEST_REFINED))
+            field = replace(field, coarsest_resolution=min(field.coarsest_resolution, COARSEST_REFINED))
         make = PublishedField if config.as_published else UnmixField
         return make(
             field,
@@ -384,7 +383,7 @@ class UnmixModel(Model):
             len(self.bands) if config.specular == "full" else len(self.specular_spectra),
             -math.log1p(-opacity) / (self.step * self._coarseness(0.0)),
             self.metadata["pixel_size"],
-            choose(config.losses.exposure, 1.0),
+            float(config.losses.exposure),
             config.light == "camera",
             self._lamp,
             self.is_unbounded,

@@ -35,6 +35,8 @@ class AlphaPreset:
     sparsity_loss_weight: float = 0.0
     surface_loss_weight: float = 0.0
     coarse_samples: int = 256
+    is_carved: bool = True
+    """Whether pictures tell where nothing is."""
     specular_endmembers: bool = False
     """Whether the specular dictionary has the endmembers' spectra too: in rooms, walls colour the light."""
 
@@ -49,6 +51,7 @@ WITHOUT_ALPHA = AlphaPreset(
     rgb_loss_weight=0.0,
     opacity_loss_weight=0.01,
     sparsity_loss_weight=1e-3,
+    is_carved=False,
     specular_endmembers=True,
 )
 UNBOUNDED = replace(WITHOUT_ALPHA, initial_opacity=0.005, surface_loss_weight=0.3, coarse_samples=64)

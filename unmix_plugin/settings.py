@@ -10,11 +10,11 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from unmix_plugin.engine.configs import AtStart, Common, DataManagerConfig, Hidden, ModelConfig, Target, short
 from unmix_plugin.errors import ConfigError, require
-from unmix_plugin.presets import AlphaPreset, Auto, choose
+from unmix_plugin.presets import AlphaPreset, Auto, choose, preset_for
 
 if TYPE_CHECKING:
     import numpy as np
@@ -27,6 +27,11 @@ Ours = Annotated[T, Hidden]
 
 LARGEST_RESOLUTION = 4096
 """Cells along an edge of a hash grid."""
+_ROWS_PER_CELL_OF_A_FACE = 1 / 3
+_FEWEST_LOG2_ROWS, _MOST_LOG2_ROWS = 16, 19
+COARSEST_REFINED = 4
+"""Cells along the scene box on the coarsest level at most where poses are refined: a pose that is off by a cell still
+finds its way."""
 COARSE_PART = 0.5
 """Part of the training in which samples move together to the distance they have in the end."""
 _LARGE_BOX = 300
@@ -162,6 +167,20 @@ class UnmixFieldConfig:
         }
         require("the field", self, rules)
 
+    def settled(self, longest_edge: float, pixel_size: float, is_unbounded: bool = False) -> UnmixFieldConfig:
+        """With the cells and rows of a scene box of this longest edge, in the unit of a pixel's edge in its middle.
+
+        A surface passes through as many cells as it has area, so the rows that large scenes need grow with the square
+        of their resolution; small ones would only learn more slowly with more rows.
+        """
+        wanted = math.ceil(self.cells_per_pixel * longest_edge / pixel_size)
+        finest = choose(self.finest_resolution, min(wanted, LARGEST_RESOLUTION))
+        finest = max(self.coarsest_resolution, finest)
+        cells = 2 * finest if is_unbounded else finest
+        rows = round(math.log2(cells**2 * _ROWS_PER_CELL_OF_A_FACE))
+        rows = choose(self.log2_rows_per_level, max(_FEWEST_LOG2_ROWS, min(rows, _MOST_LOG2_ROWS)))
+        return replace(self, finest_resolution=finest, log2_rows_per_level=rows)
+
 
 @dataclass(frozen=True)
 class RendererConfig:
@@ -175,8 +194,10 @@ class RendererConfig:
     coarse must be found first, by many rays of few samples. Auto is 256, but 64 in an unbounded world, where rays go
     on outside the box."""
     smallest_weight: Ours[float | Auto] = "auto"
-    """Samples that contribute less than this share of their ray's light are left out. Auto is 0.004,
-    but 0.001 at the start where neither alpha nor a backdrop is known."""
+    """Samples that contribute less than this share of their ray's light are left out. Auto is 0.004."""
+    first_smallest_weight: Ours[float | Auto] = "auto"
+    """The same at the start of training. Auto is 0.001 where `smallest_weight` is auto and neither alpha nor a backdrop
+    is known, else `smallest_weight`."""
     visible_weight: Ours[float | Auto] = "auto"
     """Share of its ray's light from which a sample counts as seen. Cells that no two training views have lately seen
     are left out; 1 leaves none out. Auto is 0.05 with alpha or before a backdrop, else 1."""
@@ -187,24 +208,31 @@ class RendererConfig:
             "coarse-samples of at least 1 or auto": _within(self.coarse_samples, 1),
             "smallest-weight in [0, 1) or auto": self.smallest_weight == "auto"
             or 0 <= self.smallest_weight < 1,
+            "first-smallest-weight in [0, 1) or auto": self.first_smallest_weight == "auto"
+            or 0 <= self.first_smallest_weight < 1,
             "visible-weight in (0, 1] or auto": self.visible_weight == "auto" or 0 < self.visible_weight <= 1,
         }
         require("the renderer", self, rules)
 
-    def sample_distance(self, pixel_size: float, longest_edge: float, has_alpha: bool) -> float:
-        """Distance of samples in the unit of a pixel's edge and of the scene box's longest one.
+    def settled(self, longest_edge: float, pixel_size: float, preset: AlphaPreset) -> RendererConfig:
+        """With what a scene box of this longest edge, in the unit of a pixel's edge in its middle, and the scene's
+        preset ask for."""
+        is_coarse = not preset.is_carved or longest_edge > _LARGE_BOX * pixel_size
+        first = preset.first_smallest_weight if self.smallest_weight == "auto" else self.smallest_weight
+        return replace(
+            self,
+            samples_per_pixel=choose(self.samples_per_pixel, 1.0 if is_coarse else 1.5),
+            coarse_samples=choose(self.coarse_samples, preset.coarse_samples),
+            smallest_weight=choose(self.smallest_weight, preset.smallest_weight),
+            first_smallest_weight=choose(self.first_smallest_weight, first),
+            visible_weight=choose(self.visible_weight, preset.visible_weight),
+        )
 
-        >>> [RendererConfig().sample_distance(1.0, edge, has_alpha=True) for edge in (270.0, 480.0)]
-        [0.6666666666666666, 1.0]
-        """
-        is_coarse = not has_alpha or longest_edge > _LARGE_BOX * pixel_size
-        return pixel_size / choose(self.samples_per_pixel, 1.0 if is_coarse else 1.5)
-
-    def coarseness(self, samples: float, preset: AlphaPreset, progress: float) -> float:
+    def coarseness(self, samples: float, progress: float) -> float:
         """Factor on the distance of samples, of which so many lie along the longest edge of the scene box in the end,
         when that part of the training is over."""
         left = max(1.0 - progress / COARSE_PART, 0.0)
-        return max(samples / choose(self.coarse_samples, preset.coarse_samples), 1.0) ** left
+        return max(samples / float(self.coarse_samples), 1.0) ** left
 
 
 @dataclass(frozen=True)
@@ -393,6 +421,47 @@ class UnmixModelConfig(ModelConfig):
             found = replace(found, lamp=tuple(round(float(x), 6) for x in numbers))
             reasons.append(_WHERE_LAMP[bool(found.lamp)])
         return found, "\n".join(reasons)
+
+    def settled(self, longest_edge: float, metadata: Mapping[str, Any]) -> UnmixModelConfig:
+        """With values for all that is left at `auto` after `resolve_auto` and follows from what a run keeps of its
+        scene: they stand in its config, so that no later release draws it otherwise. How many samples a step looks at,
+        and how many rays are rendered at once, depend on the machine.
+
+        Args:
+            longest_edge: Of the scene box, in the unit of the metadata's `pixel_size`.
+        Raises:
+            ConfigError: more endmembers than bands.
+        """
+        is_unbounded, pixel_size = bool(metadata.get("is_unbounded", False)), float(metadata["pixel_size"])
+        preset = preset_for(metadata["has_alpha"], is_unbounded, bool(metadata.get("has_backdrop", False)))
+        count = self.checked_num_endmembers(len(metadata["wavelengths_nm"]))
+        field = self.field
+        if self.poses == "refine":
+            field = replace(field, coarsest_resolution=min(field.coarsest_resolution, COARSEST_REFINED))
+        sizes = field.settled(longest_edge, pixel_size, is_unbounded)
+        losses = replace(
+            self.losses,
+            background=choose(self.losses.background, preset.background),
+            rgb=choose(self.losses.rgb, preset.rgb_loss_weight),
+            exposure=choose(self.losses.exposure, 1.0),
+            relative=choose(self.losses.relative, 0.0),
+            band_weights=choose(self.losses.band_weights, ()),
+        )
+        return replace(
+            self,
+            num_endmembers=count,
+            num_specular_spectra=max(self.num_dictionary_spectra(preset, count), 1),
+            light=choose(self.light, "fixed"),
+            lamp=choose(self.lamp, ()),
+            initial_opacity=choose(self.initial_opacity, preset.initial_opacity),
+            field=replace(
+                self.field,
+                finest_resolution=sizes.finest_resolution,
+                log2_rows_per_level=sizes.log2_rows_per_level,
+            ),
+            renderer=self.renderer.settled(longest_edge, pixel_size, preset),
+            losses=losses,
+        )
 
     def checked_num_endmembers(self, num_bands: int) -> int:
         """K. Raises ConfigError: more endmembers than bands."""

@@ -26,23 +26,29 @@ class Pipeline(nn.Module):
     def __init__(self, config: PipelineConfig, *, data: Path, device: torch.device, seed: int = 0) -> None:
         """Read the scene, then make the model for it, with parameters not yet initialised from the scene.
 
-        Afterwards `config` has no `auto` left; `decisions` lists what they became, and `reasons` says why.
+        `decisions` lists what settings that were `auto` became, and `reasons` says why.
 
         Raises:
             SceneError: the scene is missing or malformed.
             ConfigError: the model does not fit the scene.
         """
         super().__init__()
+        self._config = config
         self.datamanager: DataManager = config.datamanager.setup(data=data, device=device, seed=seed)
         self.seed = seed
         model_config, self.reasons = config.model.resolve_auto(
             self.datamanager.initial_data, torch.Generator().manual_seed(seed)
         )
-        self.config = replace(config, model=model_config)
         self.decisions: list[Decision] = list(settled_settings(config.model, model_config, "pipeline.model"))
         self.model: Model = model_config.setup(
             scene_box=self.datamanager.scene_box, metadata=self.datamanager.metadata()
         ).to(device)
+
+    @property
+    def config(self) -> PipelineConfig:
+        """The settings as the data manager and the model have settled them: what was `auto` and follows from the scene
+        is a value."""
+        return replace(self._config, datamanager=self.datamanager.config, model=self.model.config)
 
     def initialise(self) -> None:
         """Let the model of a new run take its first values from the scene; what the data manager decided joins

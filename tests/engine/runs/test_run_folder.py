@@ -18,6 +18,7 @@ from tests.engine.stopped_runs import quiet_trainer
 from unmix_plugin.engine.runs.atomic_files import RUN_FORMAT, whole_file, write_file, write_run_json
 from unmix_plugin.engine.runs.checkpoints import save_checkpoint
 from unmix_plugin.engine.runs.load_run import load_config, load_model, load_pipeline
+from unmix_plugin.engine.runs.migrations import OLDEST_FORMAT
 from unmix_plugin.engine.runs.run_folder import RunFolder, create_run_folder, newest_run, open_run_folder
 from unmix_plugin.engine.runs.scene_record import differences
 from unmix_plugin.engine.training.trainer import Trainer
@@ -95,7 +96,7 @@ def test_a_missing_cut_off_or_foreign_file_is_refused(trained, name, text):
     ("version", "message"),
     [
         (99, r"format 99, written by a newer version.*update this package"),
-        (RUN_FORMAT - 1, rf"format {RUN_FORMAT - 1}, written by an older version.*train again"),
+        (OLDEST_FORMAT - 1, rf"format {OLDEST_FORMAT - 1}, written by an older version.*train again"),
     ],
 )
 def test_another_version_is_refused_with_what_to_do(trained, name, version, message):

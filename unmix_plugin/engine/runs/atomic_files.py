@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from unmix_plugin.engine.runs.migrations import OLDEST_FORMAT, migrated
 from unmix_plugin.engine.runs.replacing import (
     drop_claim,
     hash_of,
@@ -163,8 +164,9 @@ def _sync(path: Path, flags: int) -> None:
         os.close(descriptor)
 
 
-RUN_FORMAT = 7
-"""Version of everything in a run folder; raised when an older version of this package could not read it."""
+RUN_FORMAT = 8
+"""Version of everything in a run folder; raised when an older version of this package could not read it, with a step in
+`migrations` that brings files of the version before to this one."""
 
 _LARGEST_INTEGER = 2**63
 _LARGEST_NUMBER = 1e18
@@ -213,14 +215,15 @@ def read_run_json(path: Path) -> dict[str, Any]:
     version = values.get("format_version") if isinstance(values, dict) else None
     if type(version) is not int:
         raise RunError(f"{path} is not a file of a run: it has no format_version")
-    if version != RUN_FORMAT:
+    if not OLDEST_FORMAT <= version <= RUN_FORMAT:
         age, advice = ("a newer", "update this package")
         if version < RUN_FORMAT:
             age, advice = ("an older", "train again, or use the version that trained it")
         raise OtherFormatError(
-            f"{path} has format {version}, written by {age} version; this one reads format {RUN_FORMAT}: {advice}"
+            f"{path} has format {version}, written by {age} version; this one reads formats {OLDEST_FORMAT} to "
+            f"{RUN_FORMAT}: {advice}"
         )
-    return values
+    return migrated(values, RUN_FORMAT)
 
 
 def read_plain_json(path: Path) -> Any:

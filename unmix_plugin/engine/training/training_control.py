@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import threading
 import time
@@ -220,7 +221,7 @@ class Interrupted(Exception):  # noqa: N818
         """Step of the newest checkpoint, from which `load_config(run)` resumes; None if there is none."""
 
 
-SAME_SIGNAL_S = 0.3
+_SAME_SIGNAL_S = 0.3
 """Within which signals are one that came by two ways."""
 
 
@@ -229,15 +230,16 @@ def stop_signals() -> Iterator[list[int]]:
     """Context in which Ctrl-C, SIGTERM or SIGHUP is only noted in the list, and a second one raises KeyboardInterrupt.
 
     A lost terminal often sends SIGHUP twice, so that a second one of these changes nothing; under nohup it stays
-    ignored. Of Ctrl-C a terminal and the process that started this one may both tell, so that what comes at once counts
-    once. In a thread that is not the main one signals can't be caught, and nothing is ever noted.
+    ignored. Of Ctrl-C a terminal and the process that started this one as one of several both tell, so that for those
+    what comes at once counts once. In a thread that is not the main one signals can't be caught, and nothing is ever
+    noted.
     """
     noted: list[int] = []
-    noted_at = 0.0
+    noted_at, same_s = 0.0, _SAME_SIGNAL_S if "WORLD_SIZE" in os.environ else 0.0
 
     def note(number: int, _frame: FrameType | None) -> None:
         nonlocal noted_at
-        is_second = bool(noted) and time.monotonic() - noted_at > SAME_SIGNAL_S
+        is_second = bool(noted) and time.monotonic() - noted_at >= same_s
         if is_second and signal.Signals(number).name != "SIGHUP":
             raise KeyboardInterrupt
         if not noted:
