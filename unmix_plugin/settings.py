@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from unmix_plugin.engine.configs import AtStart, Common, DataManagerConfig, Hidden, ModelConfig, Target, short
-from unmix_plugin.errors import ConfigError, require
+from unmix_plugin.errors import Check, ConfigError, require
 from unmix_plugin.presets import AlphaPreset, Auto, choose, preset_for
 
 if TYPE_CHECKING:
@@ -118,13 +118,13 @@ class HyperspectralDataManagerConfig(DataManagerConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        rules = {
-            "memory-gb of at least 0.01 or auto": _within(self.memory_gb, 0.01),
-            "subpixels of 1 to 8 or auto": _within(self.subpixels, 1, 8),
-            "single-ray-until in [0, 1] or auto": _within(self.single_ray_until, 0, 1),
-            "grid-resolution of 8 to 512": _within(self.grid_resolution, 8, 512),
-            "target-components of at least 1, auto or none": _within(self.target_components, 1),
-        }
+        rules = [
+            Check("memory_gb", "of at least 0.01 or auto", _within(self.memory_gb, 0.01)),
+            Check("subpixels", "of 1 to 8 or auto", _within(self.subpixels, 1, 8)),
+            Check("single_ray_until", "in [0, 1] or auto", _within(self.single_ray_until, 0, 1)),
+            Check("grid_resolution", "of 8 to 512", _within(self.grid_resolution, 8, 512)),
+            Check("target_components", "of at least 1, auto or none", _within(self.target_components, 1)),
+        ]
         require("the data manager", self, rules)
 
 
@@ -155,16 +155,20 @@ class UnmixFieldConfig:
 
     def __post_init__(self) -> None:
         finest = self.finest_resolution
-        rules = {
-            "num-levels of 1 to 32": _within(self.num_levels, 1, 32),
-            "features-per-level of 1 to 8": _within(self.features_per_level, 1, 8),
-            "coarsest-resolution of 2 to 4096": _within(self.coarsest_resolution, 2, LARGEST_RESOLUTION),
-            "finest-resolution of 2 to 4096 or auto": _within(finest, 2, LARGEST_RESOLUTION),
-            "cells-per-pixel of 0.001 to 100": _within(self.cells_per_pixel, 0.001, 100),
-            "log2-rows-per-level of 4 to 24 or auto": _within(self.log2_rows_per_level, 4, 24),
-            "hidden-width of 1 to 1024": _within(self.hidden_width, 1, 1024),
-            "a temperature of 0.01 to 100": _within(self.temperature, 0.01, 100),
-        }
+        rules = [
+            Check("num_levels", "of 1 to 32", _within(self.num_levels, 1, 32)),
+            Check("features_per_level", "of 1 to 8", _within(self.features_per_level, 1, 8)),
+            Check(
+                "coarsest_resolution",
+                "of 2 to 4096",
+                _within(self.coarsest_resolution, 2, LARGEST_RESOLUTION),
+            ),
+            Check("finest_resolution", "of 2 to 4096 or auto", _within(finest, 2, LARGEST_RESOLUTION)),
+            Check("cells_per_pixel", "of 0.001 to 100", _within(self.cells_per_pixel, 0.001, 100)),
+            Check("log2_rows_per_level", "of 4 to 24 or auto", _within(self.log2_rows_per_level, 4, 24)),
+            Check("hidden_width", "of 1 to 1024", _within(self.hidden_width, 1, 1024)),
+            Check(("temperature",), "a temperature of 0.01 to 100", _within(self.temperature, 0.01, 100)),
+        ]
         require("the field", self, rules)
 
     def settled(self, longest_edge: float, pixel_size: float, is_unbounded: bool = False) -> UnmixFieldConfig:
@@ -203,15 +207,25 @@ class RendererConfig:
     are left out; 1 leaves none out. Auto is 0.05 with alpha or before a backdrop, else 1."""
 
     def __post_init__(self) -> None:
-        rules = {
-            "samples-per-pixel of 0.01 to 100 or auto": _within(self.samples_per_pixel, 0.01, 100),
-            "coarse-samples of at least 1 or auto": _within(self.coarse_samples, 1),
-            "smallest-weight in [0, 1) or auto": self.smallest_weight == "auto"
-            or 0 <= self.smallest_weight < 1,
-            "first-smallest-weight in [0, 1) or auto": self.first_smallest_weight == "auto"
-            or 0 <= self.first_smallest_weight < 1,
-            "visible-weight in (0, 1] or auto": self.visible_weight == "auto" or 0 < self.visible_weight <= 1,
-        }
+        rules = [
+            Check("samples_per_pixel", "of 0.01 to 100 or auto", _within(self.samples_per_pixel, 0.01, 100)),
+            Check("coarse_samples", "of at least 1 or auto", _within(self.coarse_samples, 1)),
+            Check(
+                "smallest_weight",
+                "in [0, 1) or auto",
+                self.smallest_weight == "auto" or 0 <= self.smallest_weight < 1,
+            ),
+            Check(
+                "first_smallest_weight",
+                "in [0, 1) or auto",
+                self.first_smallest_weight == "auto" or 0 <= self.first_smallest_weight < 1,
+            ),
+            Check(
+                "visible_weight",
+                "in (0, 1] or auto",
+                self.visible_weight == "auto" or 0 < self.visible_weight <= 1,
+            ),
+        ]
         require("the renderer", self, rules)
 
     def settled(self, longest_edge: float, pixel_size: float, preset: AlphaPreset) -> RendererConfig:
@@ -261,15 +275,18 @@ class LossConfig:
     relative ones. Auto is 0 unless alpha is known and the brighter pixels are much brighter than the others."""
 
     def __post_init__(self) -> None:
-        rules = {
-            "spectral of at least 0": _within(self.spectral, 0),
-            "rgb of at least 0": _within(self.rgb, 0),
-            "abundances of at least 0": _within(self.abundances, 0),
-            "band-weights above 0, auto or none": self.band_weights == "auto"
-            or all(weight > 0 for weight in self.band_weights),
-            "an exposure above 0 or auto": self.exposure == "auto" or self.exposure > 0,
-            "relative in [0, 2] or auto": _within(self.relative, 0, 2),
-        }
+        rules = [
+            Check("spectral", "of at least 0", _within(self.spectral, 0)),
+            Check("rgb", "of at least 0", _within(self.rgb, 0)),
+            Check("abundances", "of at least 0", _within(self.abundances, 0)),
+            Check(
+                "band_weights",
+                "above 0, auto or none",
+                self.band_weights == "auto" or all(weight > 0 for weight in self.band_weights),
+            ),
+            Check(("exposure",), "an exposure above 0 or auto", self.exposure == "auto" or self.exposure > 0),
+            Check("relative", "in [0, 2] or auto", _within(self.relative, 0, 2)),
+        ]
         require("the losses", self, rules)
 
 
@@ -364,19 +381,41 @@ class UnmixModelConfig(ModelConfig):
         has_lamp, has_file = self.lamp not in ("auto", ()), self.endmember_file is not None
         is_lamp = len(self.lamp) == _LAMP_NUMBERS and self.lamp[0] in (0, 1)
         is_lamp = is_lamp and all(any(self.lamp[first : first + 3]) for first in (4, 7))
-        rules = {
-            "num-endmembers of 1 to 255 or auto": count is None or _within(count, 1, 255),
-            "num-specular-spectra of 1 to 256 or auto": _within(self.num_specular_spectra, 1, 256),
-            "samples-per-step of 1 to 100 million or auto": _within(self.samples_per_step, 1, 100_000_000),
-            "initial-opacity in (0, 1) or auto": opacity == "auto" or 0 < opacity < 1,
-            "a lamp of no or ten numbers, the first 0 or 1, axis and way not 0, or auto": not has_lamp
-            or is_lamp,
-            "light camera where numbers of a lamp are given": not has_lamp or self.light == "camera",
-            "light fixed or per-view: the field as published has no shading": ours or self.light != "camera",
-            "a scale per-endmember: the method as published has no shared one": ours
-            or self.field.scale == "per-endmember",
-            "endmember-file exactly when endmember-init is file": (self.endmember_init == "file") == has_file,
-        }
+        rules = [
+            Check("num_endmembers", "of 1 to 255 or auto", count is None or _within(count, 1, 255)),
+            Check("num_specular_spectra", "of 1 to 256 or auto", _within(self.num_specular_spectra, 1, 256)),
+            Check(
+                "samples_per_step",
+                "of 1 to 100 million or auto",
+                _within(self.samples_per_step, 1, 100_000_000),
+            ),
+            Check("initial_opacity", "in (0, 1) or auto", opacity == "auto" or 0 < opacity < 1),
+            Check(
+                ("lamp",),
+                "a lamp of no or ten numbers, the first 0 or 1, axis and way not 0, or auto",
+                not has_lamp or is_lamp,
+            ),
+            Check(
+                ("light", "lamp"),
+                "light camera where numbers of a lamp are given",
+                not has_lamp or self.light == "camera",
+            ),
+            Check(
+                "light",
+                "fixed or per-view: the field as published has no shading",
+                ours or self.light != "camera",
+            ),
+            Check(
+                (),
+                "a scale per-endmember: the method as published has no shared one",
+                ours or self.field.scale == "per-endmember",
+            ),
+            Check(
+                ("endmember_init", "endmember_file"),
+                "endmember-file exactly when endmember-init is file",
+                (self.endmember_init == "file") == has_file,
+            ),
+        ]
         require("the model", self, rules)
 
     def resolve_auto(

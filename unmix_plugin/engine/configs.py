@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
 import tyro
 
-from unmix_plugin.errors import ConfigError, require
+from unmix_plugin.errors import Check, ConfigError, require
 
 if TYPE_CHECKING:
     import numpy as np
@@ -87,11 +87,11 @@ class OptimizerConfig:
     """Times the parameters, added to their gradient: draws what the data leaves open to 0."""
 
     def __post_init__(self) -> None:
-        rules = {
-            "lr above 0 and finite": 0 < self.lr < math.inf,
-            "final-factor in (0, 1]": 0 < self.final_factor <= 1,
-            "weight-decay of at least 0 and finite": 0 <= self.weight_decay < math.inf,
-        }
+        rules = [
+            Check("lr", "above 0 and finite", 0 < self.lr < math.inf),
+            Check("final_factor", "in (0, 1]", 0 < self.final_factor <= 1),
+            Check("weight_decay", "of at least 0 and finite", 0 <= self.weight_decay < math.inf),
+        ]
         require("an optimizer", self, rules)
 
 
@@ -194,19 +194,34 @@ class TrainerConfig:
     """Settings of the optimiser by parameter group."""
 
     def __post_init__(self) -> None:
-        rules = {
-            "max-num-iterations of at least 0": self.max_num_iterations is None
-            or self.max_num_iterations >= 0,
-            "max-seconds above 0 and finite": self.max_seconds is None or 0 < self.max_seconds < math.inf,
-            "max-num-iterations or max-seconds": (self.max_num_iterations, self.max_seconds) != (None, None),
-            "seed of -2^63 to 2^63 - 1": -(2**63) <= self.seed < 2**63,
-            "steps-per-save of at least 0": self.steps_per_save >= 0,
-            "steps-per-eval-all-images of at least 0": self.steps_per_eval_all_images >= 0,
-            "steps-per-log of at least 1": self.steps_per_log >= 1,
-            "checkpoints-kept of at least 1": self.checkpoints_kept >= 1,
-            "average-decay in [0, 1)": self.average_decay is None or 0 <= self.average_decay < 1,
-            "a file name as method-name": bool(self.method_name) and "/" not in self.method_name,
-        }
+        rules = [
+            Check(
+                "max_num_iterations",
+                "of at least 0",
+                self.max_num_iterations is None or self.max_num_iterations >= 0,
+            ),
+            Check(
+                "max_seconds",
+                "above 0 and finite",
+                self.max_seconds is None or 0 < self.max_seconds < math.inf,
+            ),
+            Check(
+                ("max_num_iterations", "max_seconds"),
+                "max-num-iterations or max-seconds",
+                (self.max_num_iterations, self.max_seconds) != (None, None),
+            ),
+            Check("seed", "of -2^63 to 2^63 - 1", -(2**63) <= self.seed < 2**63),
+            Check("steps_per_save", "of at least 0", self.steps_per_save >= 0),
+            Check("steps_per_eval_all_images", "of at least 0", self.steps_per_eval_all_images >= 0),
+            Check("steps_per_log", "of at least 1", self.steps_per_log >= 1),
+            Check("checkpoints_kept", "of at least 1", self.checkpoints_kept >= 1),
+            Check("average_decay", "in [0, 1)", self.average_decay is None or 0 <= self.average_decay < 1),
+            Check(
+                ("method_name",),
+                "a file name as method-name",
+                bool(self.method_name) and "/" not in self.method_name,
+            ),
+        ]
         require("a training", self, rules)
 
     def progress(self, steps: int, seconds: float) -> float:

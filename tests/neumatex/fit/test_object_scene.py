@@ -128,7 +128,7 @@ def _write_pillar(folder, has_alpha=True):
     pillar.export(folder / "mesh.ply")
     cameras = load_object(folder).pictures.cameras
     shape = RayMesh(mesh_from(pillar).transformed(1 / RADIUS, torch.zeros(3)))
-    for index, path in enumerate(sorted((folder / "images").iterdir())):
+    for index, path in enumerate(sorted((folder / "images").glob("[!.]*"))):
         rays = cameras.image_rays(index)
         alpha = shape.blocked(rays.origins, rays.directions).reshape(SIZE, SIZE).numpy().astype(np.float32)
         write_exr(path, {**dict.fromkeys("RGB", 0.5 * alpha), **({"A": alpha} if has_alpha else {})}, {})
@@ -205,7 +205,7 @@ def test_pictures_and_light_of_different_units_are_told_and_mere_shade_is_not(ma
         factory.write_light(folder, sky=sky)
         assert len(_notes(folder, "different units", f"'environment_exposure_stops' {stops} higher")) == 1
     factory.write_light(folder, sky=1.0)
-    for path in (folder / "images").iterdir():
+    for path in (folder / "images").glob("[!.]*"):
         factory.write_picture(path, COLOUR, lit_rows=SIZE // 2 - 4)
     assert not _notes(folder, "units")
 
@@ -269,7 +269,7 @@ def test_keys_that_nobody_knows_are_told_also_of_held_out_lights(folder):
 
 
 def _pictures(folder, channels):
-    for path in (folder / "images").iterdir():
+    for path in (folder / "images").glob("[!.]*"):
         planes = {name: np.full((SIZE, SIZE), value, np.float32) for name, value in channels.items()}
         write_exr(path, planes, {})
 

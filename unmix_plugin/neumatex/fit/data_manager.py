@@ -28,7 +28,7 @@ from unmix_plugin.engine import (
     TrainingCallback,
     step_generator,
 )
-from unmix_plugin.errors import SceneError, require
+from unmix_plugin.errors import Check, SceneError, require
 from unmix_plugin.formats.files import numbered_apart
 from unmix_plugin.neumatex.fit.object_scene import HeldOutLight, ObjectScene, load_object
 from unmix_plugin.neumatex.fit.settings import ObjectRecord
@@ -70,7 +70,13 @@ class ObjectDataManagerConfig(DataManagerConfig):
     def __post_init__(self) -> None:
         """Refuse impossible settings."""
         super().__post_init__()
-        require("the data manager", self, {"max-pixels of at least 1": self.max_pixels >= 1})
+        require(
+            "the data manager",
+            self,
+            [
+                Check("max_pixels", "of at least 1", self.max_pixels >= 1),
+            ],
+        )
 
 
 class ObjectDataManager(DataManager):

@@ -12,7 +12,7 @@ import torch
 import tyro
 
 from unmix_plugin.engine import AtStart, Common, ModelConfig, Target, config_from_json, short
-from unmix_plugin.errors import require
+from unmix_plugin.errors import Check, require
 from unmix_plugin.neumatex.fit.tone import LightCurve, ToneMapping
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.unmixing.endmembers import EndmemberMethod
@@ -144,16 +144,20 @@ class NeumatexModelConfig(ModelConfig):
         """Refuse impossible settings."""
         super().__post_init__()
         count = self.num_endmembers
-        rules = {
-            "samples of 2 to 1024": 2 <= self.samples <= 1024,
-            "bounces of 0 to 8": 0 <= self.bounces <= 8,
-            "render-samples of 1 to 65536": 1 <= self.render_samples <= 65536,
-            "eval-samples of 1 to 65536": 1 <= self.eval_samples <= 65536,
-            "regularisation of at least 0": 0 <= self.regularisation < float("inf"),
-            "plane-resolution of 2 to 2048": 2 <= self.plane_resolution <= 2048,
-            "num-endmembers of 1 to 64 or auto": count in (None, "auto") or 1 <= int(count) <= 64,
-            "from-run with the material spectral only": self.from_run is None or self.material == "spectral",
-        }
+        rules = [
+            Check("samples", "of 2 to 1024", 2 <= self.samples <= 1024),
+            Check("bounces", "of 0 to 8", 0 <= self.bounces <= 8),
+            Check("render_samples", "of 1 to 65536", 1 <= self.render_samples <= 65536),
+            Check("eval_samples", "of 1 to 65536", 1 <= self.eval_samples <= 65536),
+            Check("regularisation", "of at least 0", 0 <= self.regularisation < float("inf")),
+            Check("plane_resolution", "of 2 to 2048", 2 <= self.plane_resolution <= 2048),
+            Check("num_endmembers", "of 1 to 64 or auto", count in (None, "auto") or 1 <= int(count) <= 64),
+            Check(
+                ("material", "from_run"),
+                "from-run with the material spectral only",
+                self.from_run is None or self.material == "spectral",
+            ),
+        ]
         require("the model", self, rules)
 
     def resolve_auto(
