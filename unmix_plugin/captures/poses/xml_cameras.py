@@ -6,8 +6,7 @@ A camera's matrix leads from the camera (OpenCV axes) to its component; the comp
 to the world, often geocentric (metres from the middle of the Earth).
 
 A sensor's lens: u = w / 2 + cx + x' f + x' b1 + y' b2, v = h / 2 + cy + y' f, with x', y' bent by k1..k4 and by p1, p2,
-which are OpenCV's p2, p1. PhotoScan up to 1.3 wrote u = cx + x' fx + y' skew, v = cy + y' fy, with
-OpenCV's p1, p2 (manual of Agisoft Lens 0.4), unless p3, p4 are there, which the manual of 1.2 has with the other order.
+which are OpenCV's p2, p1. PhotoScan up to 1.3 wrote fx and fy in place of f, which is refused by name.
 
 MicMac: Orientation-IMAGE.xml files, each with its calibration inside or in a file beside it.
 
@@ -176,29 +175,23 @@ def _lens_metashape(sensor: _Element, where: str, notes: list[str]) -> Lens | No
         calibration = _nominal_calibration(sensor)
     if calibration is None:
         return None
+    if calibration.find("f") is None and calibration.find("fx") is not None:
+        raise CaptureError(
+            f"{where} has <fx> and <fy>, as PhotoScan up to 1.3 wrote them, which is not read; open the project in "
+            "Metashape and use File > Export > Export Cameras"
+        )
     values = {tag: _number_of(calibration, tag, where) for tag in _TERMS}
-    f_x = _number_of(calibration, "fx", where, values["f"] + values["b1"])
-    f_y = _number_of(calibration, "fy", where, values["f"])
-    skew = _number_of(calibration, "skew", where, values["b2"])
+    f_x, f_y, skew = values["f"] + values["b1"], values["f"], values["b2"]
     if min(f_x, f_y) <= 0:
         raise CaptureError(f"{where} has the focal length {min(f_x, f_y):g}; expected pixels above 0")
-    is_old = calibration.find("f") is None
-    center_x, center_y = (
-        _number_of(calibration, tag, where, side / 2) if is_old else side / 2 + values[tag]
-        for tag, side in (("cx", width), ("cy", height))
-    )
+    center_x, center_y = width / 2 + values["cx"], height / 2 + values["cy"]
     if not (0 <= center_x <= width and 0 <= center_y <= height):
         raise CaptureError(
             f"{where} has the principal point {center_x:g}, {center_y:g}, outside its {width} x {height} pixels; check "
             "<cx>, <cy> and <resolution> in the file"
         )
     notes += _unknown_terms(calibration, name)
-    is_opencv = is_old and calibration.find("p3") is None and calibration.find("p4") is None
-    tangential = (values["p1"], values["p2"]) if is_opencv else (values["p2"], values["p1"])
-    if is_old and any(tangential):
-        later = "p2, p1, as p3 or p4 is there (PhotoScan from 1.2)"
-        taken = "p1, p2 (PhotoScan up to 1.1)" if is_opencv else later
-        notes.append(f"sensor {name}: p1, p2 beside <fx>, <fy> are taken as OpenCV's {taken}")
+    tangential = (values["p2"], values["p1"])
     start, growth = Lens(width, height, (f_x, f_y), (center_x, center_y)), (values["p3"], values["p4"])
     k1, k2, k3, k4 = (values[key] for key in _RADIAL)
     frame = replace(start, distortion=(k1, k2, *tangential), higher_radial=(k3, k4))
@@ -220,7 +213,7 @@ def _unknown_terms(calibration: _Element, name: str) -> list[str]:
     unknown = []
     for child in calibration:
         with suppress(ValueError):
-            if child.tag not in (*_TERMS, "fx", "fy", "skew") and float(child.text or ""):
+            if child.tag not in _TERMS and float(child.text or ""):
                 unknown.append(child.tag)
     note = f"sensor {name}: numbers that are not known and not used: {name_some(unknown)}"
     return [note] if unknown else []
@@ -254,8 +247,9 @@ def _nominal_calibration(sensor: _Element) -> _Element | None:
     if not 0 < min(focal, *sides) <= max(focal, *sides) < np.inf:
         return None
     calibration = ElementTree.Element("calibration")
-    for tag, side in zip(("fx", "fy"), sides, strict=True):
-        ElementTree.SubElement(calibration, tag).text = repr(focal / side)
+    across, down = (focal / side for side in sides)
+    for tag, value in (("f", down), ("b1", across - down)):
+        ElementTree.SubElement(calibration, tag).text = repr(value)
     return calibration
 
 

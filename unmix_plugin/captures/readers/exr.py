@@ -44,7 +44,6 @@ _LENGTH = re.compile(rf"{_LAYER}{_NUMBER}([{''.join(_POWERS)}]?)m")
 _FREQUENCY = re.compile(rf"{_LAYER}{_NUMBER}([{''.join(_POWERS)}]?)Hz")
 _RANGE = re.compile(rf"{_LAYER}{_NUMBER} ?- ?{_NUMBER} ?nm")
 _PLAIN = re.compile(rf"{_LAYER}{_NUMBER}")
-_METRES_PER_SECOND = 299_792_458.0
 _ALPHA = ("A", "alpha")
 _COLOURS = (("R", "G", "B"), ("red", "green", "blue"))
 _OF_ALL_FILES = ("pixelAspectRatio", "screenWindowWidth")
@@ -205,6 +204,11 @@ def _choose(
         return BandTable(names=(wanted,)), [channels[names.index(wanted)]]
     by_name = {channel.name: channel for channel in reversed(channels)}
     spectral = _spectral_channels(list(by_name))
+    if in_hertz := [name for name in names if _FREQUENCY.fullmatch(name)]:
+        raise CaptureError(
+            f"{path}: the channel {in_hertz[0]} is named by a frequency, which is not read; name channels by "
+            "wavelengths, such as S0.550,000000nm"
+        )
     known = {channel.layer for channel in spectral}
     layers = [layer for layer in LAYERS if layer in known] + sorted(known - {*LAYERS})
     if wanted is not None and wanted not in layers:
@@ -266,7 +270,7 @@ def _spectral_channels(names: Sequence[str]) -> list[_SpectralChannel]:
     >>> [channel.nm for channel in _spectral_channels(["R", "T.390,000000nm", "T.380,5nm"])]
     [380.5, 390.0]
     """
-    for patterns in ((_RANGE, _LENGTH, _FREQUENCY), (_PLAIN,)):
+    for patterns in ((_RANGE, _LENGTH), (_PLAIN,)):
         found = [channel for name in names if (channel := _spectral_channel(name, patterns))]
         if found:
             return sorted(found, key=lambda channel: (channel.layer, channel.nm))
@@ -286,10 +290,7 @@ def _spectral_channel(name: str, patterns: Sequence[re.Pattern[str]]) -> _Spectr
     nm = number if match.re is _PLAIN else number * 10.0 ** _POWERS[match[3]]
     if match.re is _LENGTH:
         nm *= 1e9
-    elif match.re is _FREQUENCY:
-        nm = _METRES_PER_SECOND / nm * 1e9 if nm > 0 else 0.0
-    is_reradiated = _LENGTH.fullmatch(layer) or _FREQUENCY.fullmatch(layer)
-    if is_reradiated or not PLAUSIBLE_NM[0] <= nm <= PLAUSIBLE_NM[1]:
+    if _LENGTH.fullmatch(layer) or not PLAUSIBLE_NM[0] <= nm <= PLAUSIBLE_NM[1]:
         return None
     return _SpectralChannel(name, layer, round(nm, 6), None)
 
