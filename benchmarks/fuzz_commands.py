@@ -163,7 +163,6 @@ def make_folders(place: Path) -> dict[str, tuple[str, ...]]:
     data_sets.write_nespof(add("nespof", "nespof"))
     data_sets.write_real(add("nespof-real", "nespof-real"))
     data_sets.write_unmix(add("unmix-nerf", "unmix-nerf"))
-    data_sets.write_hs(add("hs-nerf", "hs-nerf", "--wavelengths", "450,500,550,600"))
     rig_flight.write_flight(add("rig", "rig", "--poses", "IN/poses.json", "--mask", "none"), releases=3)
     rig_flight.write_poses(place / "rig" / "poses.json", releases=3)
     shutil.copytree(small_run(place / "training").run, place / "run")

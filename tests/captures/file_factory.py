@@ -11,7 +11,6 @@ import h5py
 import numpy as np
 import pytest
 import scipy.io
-import torch
 from PIL import Image
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
@@ -197,10 +196,6 @@ def netcdf3(path, arrays):
             file.createVariable(name, array.dtype.newbyteorder("="), names)[:] = array
 
 
-def tensors(path, arrays, **options):
-    torch.save({name: torch.tensor(array) for name, array in arrays.items()}, path, **options)
-
-
 ARRAY_WRITERS: dict[str, Callable[..., object]] = {
     "v5.mat": scipy.io.savemat,
     "compressed.mat": partial(scipy.io.savemat, do_compression=True),
@@ -210,7 +205,5 @@ ARRAY_WRITERS: dict[str, Callable[..., object]] = {
     "cube.nc": netcdf3,
     "cube.npz": lambda path, arrays: np.savez(path, **arrays),
     "small.npz": lambda path, arrays: np.savez_compressed(path, **arrays),
-    "cube.pt": tensors,
-    "legacy.pt": partial(tensors, _use_new_zipfile_serialization=False),
 }
 """By the name of a file: writes arrays by name."""

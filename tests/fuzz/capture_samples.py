@@ -125,7 +125,6 @@ SAMPLES: dict[str, Callable[[], tuple[bytes, ...]]] = {
     "cube.nc": lambda: _arrays("cube.nc"),
     "cube.npy": lambda: tuple(array_bytes(cube) for cube in (CUBE, CUBE.astype(">f4"), CUBE[..., 0])),
     "cube.npz": lambda: _arrays("small.npz"),
-    "cube.pt": lambda: _arrays("cube.pt", "legacy.pt"),
     "cube.png": _pictures,
 }
 """By the name of the file."""

@@ -17,7 +17,6 @@ _LAYOUTS = {
     "cubes": "cubes:find_cubes",
     "nespof": "transforms:find_nespof",
     "nespof-real": "transforms:find_nespof_real",
-    "hs-nerf": "transforms:find_hs_nerf",
     "unmix-nerf": "transforms:find_unmix_nerf",
     "nerfstudio": "transforms:find_nerfstudio",
     "rig": "rig:find_rig",
@@ -25,6 +24,10 @@ _LAYOUTS = {
 """Module of layouts/, and the function in it that makes a `Capture` of a folder, imported when it is used."""
 
 LAYOUTS = tuple(_LAYOUTS)
+GONE_LAYOUTS = {
+    "hs-nerf": "save its .pt tensors as .npy (numpy.save), name these in transforms.json and take the layout unmix-nerf"
+}
+"""Layouts that earlier releases had, and what to do."""
 
 MaskKind = Literal["auto", "files", "white", "black", "none"]
 

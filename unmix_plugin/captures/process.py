@@ -16,7 +16,7 @@ import numpy as np
 from unmix_plugin.captures.calibration.references import require_comparable
 from unmix_plugin.captures.finding_poses import check_pose_options, marked_poses, poses_of_written_views
 from unmix_plugin.captures.match_checks import views_of_other_poses
-from unmix_plugin.captures.options import LAYOUTS, ProcessOptions, find_views
+from unmix_plugin.captures.options import GONE_LAYOUTS, LAYOUTS, ProcessOptions, find_views
 from unmix_plugin.captures.plan import Plan, hashes, input_files, make_plan
 from unmix_plugin.captures.poses.estimation import WORK_FILES
 from unmix_plugin.captures.poses.lens import Lens
@@ -228,6 +228,8 @@ def _refuse_late(lenses: Collection[str]) -> None:
 
 
 def _check(options: ProcessOptions) -> None:
+    if options.layout in GONE_LAYOUTS:
+        raise ConfigError(f"the layout '{options.layout}' is no longer read: {GONE_LAYOUTS[options.layout]}")
     if options.layout not in LAYOUTS:
         raise ConfigError(
             f"'{options.layout}' is not a layout; expected one of {', '.join(LAYOUTS)}"

@@ -44,7 +44,7 @@ class ReadOptions:
     wavelengths_nm: Float64[np.ndarray, " B"] | None = None
     """Band centres in nm, in the order of the file."""
     axes: Axes | None = None
-    """Order of the axes in formats that don't fix it: NumPy, MATLAB, HDF5, torch, pages of a TIFF."""
+    """Order of the axes in formats that don't fix it: NumPy, MATLAB, HDF5, pages of a TIFF."""
     size: tuple[int, int] | None = None
     """Rows and columns of an image that is stored as a list of pixels, column after column as MATLAB writes it."""
     exclude: tuple[Path, ...] = ()
@@ -136,7 +136,7 @@ class SpectralFile:
     path: Path
     """The file that was named: a header where there is one."""
     reader: str
-    """Name of the reader: envi, tiff, exr, matlab, hdf5, netcdf, npy, torch, picture."""
+    """Name of the reader: envi, tiff, exr, matlab, hdf5, netcdf, npy, picture."""
     shape: tuple[int, int, int]
     """H, W, B."""
     dtype: np.dtype

@@ -1,11 +1,10 @@
-"""Small data sets in the layouts of others, written with NumPy, OpenEXR, torch and Pillow."""
+"""Small data sets in the layouts of others, written with NumPy, OpenEXR and Pillow."""
 
 import json
 from pathlib import Path
 
 import numpy as np
 import OpenEXR
-import torch
 from PIL import Image
 
 from unmix_plugin.captures.spectral_file import ReadOptions
@@ -102,17 +101,3 @@ def write_unmix(root, written="eval", named="val", **top):
         frames.append(files | {"seg_file_path": f"{folder}/{name}_seg.png", "transform_matrix": pose(index)})
     bands = {"wavelengths": [450, 500, 550, 600]}
     write_json(root / "transforms.json", LENS | bands | top | {"frames": frames})
-
-
-def write_hs(root, kind=torch.uint8):
-    frames = []
-    for index in range(3):
-        (root / "plant" / "torch").mkdir(parents=True, exist_ok=True)
-        values = torch.from_numpy(cube(index))
-        tensor = (values * 255).to(kind) if kind == torch.uint8 else values.to(kind)
-        torch.save(tensor, root / "plant" / "torch" / f"frame_{index:05d}.pt")
-        write_picture(root / "images" / f"frame_{index:05d}.jpg")
-        paths = (f"images/frame_{index:05d}.jpg", f"plant/torch/frame_{index:05d}.pt", pose(index))
-        keys = ("file_path", "hyperspectral_file_path", "transform_matrix")
-        frames.append(dict(zip(keys, paths, strict=True)))
-    write_json(root / "transforms.json", LENS | {"frames": frames})

@@ -1,4 +1,4 @@
-"""Layouts with a transforms.json: unmix-nerf, hs-nerf, nerfstudio.
+"""Layouts with a transforms.json: unmix-nerf, nerfstudio.
 
 From the folder of each layout to a scene that loads, with the values and splits that were there.
 """
@@ -9,7 +9,6 @@ from functools import partial
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 
 from tests.captures.capture_factory import process
@@ -20,17 +19,16 @@ from tests.captures.layouts.data_sets import (
     cube,
     intensity,
     pose,
-    write_hs,
     write_json,
     write_nespof,
     write_picture,
     write_real,
     write_unmix,
 )
-from unmix_plugin.captures.layouts.transforms import find_hs_nerf, find_nerfstudio, find_unmix_nerf
+from unmix_plugin.captures.layouts.transforms import find_nerfstudio, find_unmix_nerf
 from unmix_plugin.captures.options import LAYOUTS, find_views
 from unmix_plugin.captures.spectral_file import ReadOptions
-from unmix_plugin.errors import CaptureError
+from unmix_plugin.errors import CaptureError, ConfigError
 from unmix_plugin.scenes.reading.loader import load_scene
 
 pytestmark = pytest.mark.usefixtures("no_contact_sheet")
@@ -230,19 +228,6 @@ def test_a_spoilt_list_of_frames_is_refused(tmp_path, spoil, message):
         find_unmix_nerf(tmp_path / "scene", PLAIN)
 
 
-@pytest.mark.parametrize(("kind", "scale"), [(torch.uint8, 255.0), (torch.float32, None)])
-def test_tensors_of_8_bits_are_fractions_of_255(tmp_path, kind, scale):
-    write_hs(tmp_path, kind)
-    capture = find_hs_nerf(tmp_path, PLAIN)
-    assert capture.layout == "hs-nerf"
-    for index, view in enumerate(capture.views):
-        check_file(view.cube, scale=scale, nm=None)
-        np.testing.assert_allclose(view.cube.read() / (scale or 1.0), cube(index), atol=1.01 / 255)
-        assert present(view.picture).name == f"frame_{index:05d}.jpg"
-    with pytest.raises(CaptureError, match=r"frame_00000.pt.* 3 "):
-        find_hs_nerf(tmp_path, ReadOptions(wavelengths_nm=np.array([450.0, 500.0, 550.0])))
-
-
 def test_a_mask_that_is_not_there_is_refused_and_missing_labels_are_said(tmp_path):
     write_unmix(tmp_path)
     (tmp_path / "train" / "frame_00001_seg.png").unlink()
@@ -313,11 +298,15 @@ SEEN = (OPACITY > 0)[..., None]
 NM = [450, 500, 550, 600]
 SCENES = {
     "nerfstudio": (write_val, {"wavelengths": "610,550,465"}, [465, 550, 610], linear_picture),
-    "hs-nerf": (write_hs, {"wavelengths": "450,500,550,600"}, NM, lambda _: cube(2)),
     "unmix-nerf": (write_unmix, {"mask": "none"}, NM, lambda _: cube(2)),
     "nespof": (write_nespof, {"scale": 2.0}, [450, 460, 470], lambda _: SEEN * halves_of(450, 460, 470)),
     "nespof-real": (write_three, {"scale": 2.0}, [450, 460], lambda _: halves_of(450, 460)),
 }
+
+
+def test_a_layout_that_is_gone_is_refused_with_what_to_do(tmp_path):
+    with pytest.raises(ConfigError, match="'hs-nerf' is no longer read: save its"):
+        process(tmp_path, tmp_path / "scene", "hs-nerf")
 
 
 @pytest.mark.parametrize("layout", SCENES)
@@ -330,8 +319,7 @@ def test_each_layout_becomes_a_scene_with_its_values_and_splits(tmp_path, layout
             process(tmp_path / "data", tmp_path / "scene", layout)
     process(tmp_path / "data", tmp_path / "scene", layout, **{"scale": 1.0, **options})
     scene = load_scene(tmp_path / "scene")
-    atol = 1.01 / 255 if layout == "hs-nerf" else 1e-4
-    np.testing.assert_allclose(scene.cube(2), values(tmp_path / "data"), atol=atol)
+    np.testing.assert_allclose(scene.cube(2), values(tmp_path / "data"), atol=1e-4)
     assert scene.wavelengths_nm.tolist() == nm
     evaluated = [scene.frames[index].name for index in scene.eval_indices]
     if layout == "unmix-nerf":

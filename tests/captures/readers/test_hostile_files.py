@@ -17,7 +17,6 @@ import h5py
 import numpy as np
 import pytest
 import tifffile
-import torch
 from PIL import Image
 
 from tests.captures.file_factory import header_text
@@ -133,7 +132,6 @@ def quick():
 
 
 MANY_TAGS = b"II*\0" + struct.pack("<IH", 8, 60_000) + bytes(12 * 60_000 + 4)
-LONG_WORD = b"\x80\x02c" + b"x" * 100_000 + b"\nname\n."
 HOSTILE: dict[str, tuple[Callable[[Path], object], str]] = {
     "loop.tif": (looping_pages, "page 2 leads back to an earlier one"),
     "big-loop.tif": (partial(looping_pages, big=True), "page 1 leads back to an earlier one"),
@@ -157,8 +155,6 @@ HOSTILE: dict[str, tuple[Callable[[Path], object], str]] = {
     "packed.mat": (packed_variable, "decode to 810,000"),
     "variables.mat": (many_variables, "101 variables"),
     "packed.exr": (lambda path: write_exr(path, {"S0.450,0nm": ZEROS}), "decode to 3,240,000"),
-    "word.pt": (lambda path: path.write_bytes(LONG_WORD), "a word of 100005 letters"),
-    "expanded.pt": (lambda path: torch.save(torch.zeros(1).expand(2000, 10**6), path), "to 8,000,000,000"),
 }
 
 

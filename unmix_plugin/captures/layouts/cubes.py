@@ -32,7 +32,7 @@ from unmix_plugin.formats.envi import header_beside
 from unmix_plugin.formats.files import safe_name
 
 _CUBE_SUFFIXES = frozenset(
-    {".hdr", ".npy", ".npz", ".tif", ".tiff", ".exr", ".mat", ".h5", ".hdf5", ".he5", ".nc", ".nc4", ".pt"}
+    {".hdr", ".npy", ".npz", ".tif", ".tiff", ".exr", ".mat", ".h5", ".hdf5", ".he5", ".nc", ".nc4"}
 )
 _NUMBERS = frozenset(
     {".img", ".dat", ".raw", ".bil", ".bip", ".bsq", ".bin", ".cube", ".hyspex", ".fits", ".zip", ".gz"}

@@ -1,4 +1,4 @@
-"""Layouts with a transforms.json of nerfstudio's form: `nerfstudio`, `unmix-nerf`, `hs-nerf`, `nespof`; and
+"""Layouts with a transforms.json of nerfstudio's form: `nerfstudio`, `unmix-nerf`, `nespof`; and
 NeSpoF's captures, `nespof-real`.
 
 The frames are those of transforms.json, or of Blender's transforms_train.json and its like, whose paths have no suffix.
@@ -6,8 +6,8 @@ The frames are those of transforms.json, or of Blender's transforms_train.json a
 `nerfstudio`: RGB pictures, each as a cube of three bands without wavelengths; an alpha channel says what is matter.
 Files of other kinds are opened as what they are, such as the ENVI headers of HSI-Nerfstudio in `datadir`.
 
-`unmix-nerf`, `hs-nerf`: frames have `hyperspectral_file_path`. UnMix-NeRF names .npy cubes, wavelengths and labels,
-HS-NeRF .pt tensors of 8 bits without wavelengths. Splits are lists in the file, otherwise the folder of a frame's file:
+`unmix-nerf`: frames have `hyperspectral_file_path`. UnMix-NeRF names .npy cubes, wavelengths and labels. Splits are
+lists in the file, otherwise the folder of a frame's file:
 `train` against `eval`, `val` or `test`. Paths with `val` whose files lie in `eval`, as UnMix-NeRF's converter leaves
 them, are followed there. Keys of scene folders are followed, too: `value_scale`, `fwhm`, and `bands`, `sensor` and
 `capture` of a frame.
@@ -241,8 +241,7 @@ def _find_cubes(layout: str, root: Path, options: ReadOptions) -> Capture:
 
 
 find_unmix_nerf = partial(_find_cubes, "unmix-nerf")
-find_hs_nerf = partial(_find_cubes, "hs-nerf")
-"""Views of a scene of UnMix-NeRF and of HS-NeRF; CaptureError where files are missing or lie outside of the folder."""
+"""Views of a scene of UnMix-NeRF; CaptureError where files are missing or lie outside of the folder."""
 
 
 def _in_eval(text: str) -> str:

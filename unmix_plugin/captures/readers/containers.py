@@ -1,12 +1,10 @@
-"""How NumPy, torch, NetCDF-3, HDF5 (with NetCDF-4 and MATLAB 7.3) and MATLAB 5 to 7 store arrays by name.
+"""How NumPy, NetCDF-3, HDF5 (with NetCDF-4 and MATLAB 7.3) and MATLAB 5 to 7 store arrays by name.
 
 Files are opened to list their arrays and closed again, so that many can be in use at a time.
 """
 
 from __future__ import annotations
 
-import pickle
-import pickletools
 import struct
 import zipfile
 import zlib
@@ -40,7 +38,6 @@ from unmix_plugin.limits import (
     allow_depth,
     allow_parts,
     open_zip,
-    refuse,
 )
 from unmix_plugin.scenes.reading.cubes import (
     READ_HEADER,
@@ -103,79 +100,6 @@ def _unpack_member(path: Path, numbers: np.ndarray, name: str) -> None:
                 raise CaptureError(f"{path}: {name} is cut short; copy the file again")
             flat[at : at + len(piece)] = np.frombuffer(piece, np.uint8)
             at += len(piece)
-
-
-# Tensors that torch.save wrote: read with weights_only, which loads no code.
-
-
-def _list_torch(path: Path) -> list[FoundArray]:
-    """A tensor, or the tensors of a dictionary."""
-    _check_pickle(path)
-    found, arrays = _tensors(path), []
-    allow_parts(path, len(found), "tensors", CaptureError)
-    for name, tensor in found.items():  # of which many numbers can be one in the file
-        allow_decoded(path, tensor.numel() * tensor.element_size(), CaptureError)
-        dtype, shape = _as_array(tensor[:0] if tensor.ndim else tensor).dtype, tuple(tensor.shape)
-        arrays.append(
-            FoundArray(name, shape, dtype, Decoded(path, dtype, shape or (1,), _copy_tensor, (name,)))
-        )
-    return arrays
-
-
-def _tensors(path: Path) -> dict[str, Any]:
-    """By name, mapped where the file allows it."""
-    import torch
-
-    with path.open("rb") as file:
-        is_mappable = file.read(2) == b"PK"
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True, mmap=is_mappable)
-    except pickle.UnpicklingError as error:
-        raise CaptureError(
-            f"{path}: holds other objects than tensors, which are never loaded because they can run code"
-        ) from error
-    named = content if isinstance(content, dict) else {"": content}
-    return {str(name): value for name, value in named.items() if isinstance(value, torch.Tensor)}
-
-
-def _as_array(tensor: Any) -> np.ndarray:
-    """What NumPy has no type for becomes float32."""
-    import torch
-
-    tensor = tensor.detach()
-    return (tensor.float() if tensor.dtype == torch.bfloat16 else tensor.resolve_neg()).numpy()
-
-
-def _copy_tensor(path: Path, numbers: np.ndarray, name: str) -> None:
-    numbers[...] = _as_array(_tensors(path)[name])
-
-
-_MOST_OPERATIONS, _LONGEST_WORD = 1 << 20, 1024
-"""Of a pickle of tensors. What torch says of words that it refuses takes time that grows with the square of them."""
-_PICKLES = 5
-"""In a row, in files of old torch: two numbers, facts of the machine, the tensors, the names of their numbers."""
-
-
-def _check_pickle(path: Path) -> None:
-    """Look through what the file would have loaded, without loading any of it."""
-
-    def look(stream: Any) -> None:
-        for number, (_, word, _) in enumerate(pickletools.genops(stream)):
-            if number >= _MOST_OPERATIONS:
-                refuse(path, f"more than {number} steps of a pickle", "those of tensors", CaptureError)
-            if isinstance(word, str | bytes) and len(word) > _LONGEST_WORD:
-                refuse(path, f"a word of {len(word)} letters", f"at most {_LONGEST_WORD}", CaptureError)
-
-    with path.open("rb") as file:
-        if file.read(2) == b"PK":
-            with open_zip(path, CaptureError) as archive:
-                name = next(name for name in archive.namelist() if name.endswith("/data.pkl"))
-                with archive.open(name) as stream:
-                    look(stream)
-            return
-        file.seek(0)
-        for _ in range(_PICKLES):
-            look(file)
 
 
 # NetCDF of the classic kind, copied by SciPy, as the numbers of a variable need not stand together.
@@ -499,7 +423,6 @@ def _unpack(path: Path, numbers: np.ndarray, name: str, offset: int, packed: tup
 KINDS: dict[str, tuple[str, Callable[[Path], list[FoundArray]]]] = {
     "npy": ("npy", _list_npy),
     "npz": ("npy", _list_npz),
-    "torch": ("torch", _list_torch),
     "netcdf": ("netcdf", _list_netcdf3),
     "matlab": ("matlab", _list_matlab),
 }

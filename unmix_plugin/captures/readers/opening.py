@@ -51,7 +51,7 @@ _BEGINNINGS = {
     b"\x89PNG\r\n\x1a\n": "picture",
     b"\xff\xd8\xff": "picture",
 }
-_SUFFIXES = {".hdr": "envi", ".pt": "torch", ".pth": "torch"}
+_SUFFIXES = {".hdr": "envi"}
 """Kinds that their first bytes don't tell, or that are refused with a better reason by their reader."""
 _LFS_POINTER = b"version https://git-lfs"
 _REFUSED = {
@@ -64,13 +64,16 @@ _REFUSED = {
     b"<html": "a web page, perhaps in place of a download; download the file again",
     b"#?RADIANCE": "a Radiance picture, which holds no spectral bands",
 }
-_KNOWN = "ENVI, TIFF, OpenEXR, MATLAB, HDF5, NetCDF, .npy, .npz, .pt, PNG, JPEG, or a folder with one picture a band"
+_KNOWN = (
+    "ENVI, TIFF, OpenEXR, MATLAB, HDF5, NetCDF, .npy, .npz, PNG, JPEG, or a folder with one picture a band"
+)
+_OF_TORCH = "tensors of PyTorch, which are not read; save them as .npy: numpy.save(name, tensor.numpy())"
 _HDF5_STARTS = (512, 1024, 2048, 4096)
 """Where the mark of HDF5 may follow bytes of another program."""
 _LARGEST_PROOF = 2**28
 """Bytes of a row that is read as a proof; of larger ones a single band, or nothing."""
 _LONGEST_TEXT = 500
-_OF_ARRAYS = ("npy", "torch", "matlab", "hdf5", "netcdf")
+_OF_ARRAYS = ("npy", "matlab", "hdf5", "netcdf")
 _USED_BY = {"dataset": (*_OF_ARRAYS, "exr"), "axes": (*_OF_ARRAYS, "tiff"), "size": _OF_ARRAYS}
 """Options that change nothing in files of other readers."""
 _FACTS = (
@@ -180,7 +183,7 @@ def _by_content(path: Path, begin: bytes) -> str | None:
         with open_zip(path, CaptureError) as archive:
             names = archive.namelist()
         if any(name.endswith("/data.pkl") for name in names):
-            return "torch"
+            raise CaptureError(f"{path}: {_OF_TORCH}")
         if names and all(name.endswith(".npy") for name in names):
             return "npz"
         raise CaptureError(f"{path}: a zip archive ({', '.join(names[:3]) or 'empty'}); unpack it first")
@@ -189,6 +192,8 @@ def _by_content(path: Path, begin: bytes) -> str | None:
     refused = next((why for magic, why in _REFUSED.items() if begin.lstrip().startswith(magic)), None)
     if refused is not None:
         raise CaptureError(f"{path}: {refused}")
+    if path.suffix.lower() in (".pt", ".pth"):
+        raise CaptureError(f"{path}: {_OF_TORCH}")
     return _SUFFIXES.get(path.suffix.lower())
 
 
