@@ -12,6 +12,7 @@ DEPENDS_ON: dict[str, tuple[str, ...]] = {
     "captures_training": ("captures", "light", "losses", "rendering", "model.py", "field.py"),
     "confidence": ("trained", "spectral", "model.py", "field.py"),
     "cost512": ("operators", "rendering", "engine"),
+    "decisions": ("scenes", "captures/match_checks.py", "datamanager.py"),
     "disturbed": ("captures", "scenes"),
     "editing": ("editing", "trained"),
     "equal_steps": ("rendering", "losses", "operators", "model.py", "field.py", "datamanager.py"),
