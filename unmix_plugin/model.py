@@ -16,6 +16,7 @@ import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -79,6 +80,15 @@ class UnmixModel(Model):
     rgb_weights: Tensor
     every_band: Tensor
     endmember_bound: Tensor
+
+    @classmethod
+    def check_tensors(cls, metadata: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
+        """Refuse another grid than the checkpoint's. Raises KeyError, ValueError."""
+        shape, found = (metadata["grid_resolution"],) * 3, tuple(tensors["grid.occupied"].shape)
+        if shape != found:
+            raise ValueError(
+                f"grid_resolution is {shape[0]} in scene.json, and the checkpoint has a grid of {found}"
+            )
 
     def populate_modules(self) -> None:
         """Field, grid, endmembers (K, B) and specular spectra (J, B), shaped by config and metadata. Raises

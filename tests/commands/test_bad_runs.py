@@ -80,6 +80,10 @@ SPOILT = {
     "circle of links": (lambda path: (path / "notes").symlink_to("notes"), "can't open the run folder"),
     "scene.json cut off": (cut_off("scene.json"), "can't read"),
     "views outside": (in_scene("summary", frames=[f"../{i}" for i in range(8)]), "the name of a frame"),
+    "another grid": (
+        in_scene("metadata", grid_resolution=512),
+        "grid_resolution",
+    ),
     "grid of gigabytes": (in_scene("metadata", grid_resolution=1290), "a grid_resolution of 8 to 512"),
     "bands of text": (in_scene("metadata", wavelengths_nm=["red"]), "expected a number"),
     "root of no kind": (in_scene("summary", root=7), "expected text"),

@@ -6,6 +6,7 @@ import re
 import sys
 import types
 from pathlib import Path
+from typing import Any, get_args
 
 import pytest
 
@@ -61,3 +62,21 @@ def test_the_example_of_the_page_imports_public_names_only_trains_and_is_evaluat
     assert "the method spectral-grid makes no scene of mixed materials" in " ".join(ended.err.split())
     done(render, "--run", path, "--output", tmp_path / "views", "--device", "cpu")
     assert len(list((tmp_path / "views" / "spectral").glob("*.hdr"))) == 2
+
+
+def test_the_outputs_and_the_product_of_the_page_are_ones():
+    blocks = re.findall(r"^```python\n(.*?)^```", PAGE, flags=re.DOTALL | re.MULTILINE)
+    [shown] = [block for block in blocks if block.startswith("outputs = (")]
+    names: dict[str, Any] = {"Output": Output}
+    exec(compile(shown, "plugins.md", "exec"), names)
+    spectral, depth, roughness = names["outputs"]
+    assert spectral.what == "radiance on black, 1 = full scale"
+    assert depth.what == "distance along the viewing axis in world units"
+    assert (roughness.value_range, roughness.colour_map) == ((0.0, 1.0), "magma")
+    kinds = set(re.findall(r"`(\w+)`", "".join(re.findall(r"^  \| (.*?) \|", PAGE, re.MULTILINE))))
+    kinds |= set(re.findall(r"; `(\w+)`: of what is seen", PAGE))
+    assert kinds == set(get_args(registry.OutputKind))
+    [product] = [block for block in blocks if "class Grid(RunProduct)" in block]
+    names = {}
+    exec(compile(product, "plugins.md", "exec"), names)
+    assert names["Grid"]().name == "grid"

@@ -87,7 +87,7 @@ def test_a_target_is_looked_for_in_the_bands_with_light(target, method, dark):
     found = asked.fit(reflectance)(reflectance)
     assert found.isfinite().all()
     assert_close(found, expected.fit(spectra[:, [0, 2, 3, 4]])(spectra[:, [0, 2, 3, 4]]))
-    assert asked.what == f"{expected.what}; 1 of 5 bands left out: no light"
+    assert asked.what == f"{expected.what}, 1 of 5 bands left out: no light"
 
 
 def test_an_absorption_is_that_of_the_bands_with_light():

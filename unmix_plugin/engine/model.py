@@ -167,6 +167,11 @@ class Model(nn.Module, ABC):
     def populate_modules(self) -> None:
         """Make the modules, parameters and buffers, their shapes from `config`, `scene_box` and `metadata` only."""
 
+    @classmethod
+    def check_tensors(cls, metadata: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
+        """Refuse, before a model is made, metadata for which it would take far more memory than the tensors of a
+        checkpoint, by their names in `state_dict`. Raises ValueError."""
+
     def initialise(self, initial_data: Mapping[str, np.ndarray], generator: torch.Generator) -> None:
         """Fill parameters and buffers from the data manager's `initial_data`; called once when a run starts, after
         the move to the device, and never when one is loaded. `generator` is on the CPU."""

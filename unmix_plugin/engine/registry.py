@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Literal, TypeVar
@@ -115,23 +115,62 @@ black (3); linear light on black (3); a picture not multiplied by opacity (3); o
 number a pixel; uint8 ids, 255 where nothing is; unit vectors (3)."""
 
 
+WORLD_UNITS, METRES = "world units", "metres"
+"""Units of outputs that are lengths; maps in metres turn the one into the other."""
+
+
 @dataclass(frozen=True)
 class Output:
-    """One thing that can be shown of a trained scene."""
+    """One thing that can be shown of a trained scene. What programs ask of it is a field; sentences are printed."""
 
     name: str
     """In commands, files and the viewer."""
     kind: OutputKind
     title: str
     """What a menu says."""
-    what: str
-    """What its numbers are, with their unit."""
+    label: str
+    """What its numbers are, without their unit, as a colour bar says it."""
     value_range: tuple[float, float] | None = None
     """Values at the ends of a colour map; None where only the views tell."""
     colour_map: str = "viridis"
     """As matplotlib names it."""
     classes: tuple[tuple[str, tuple[float, ...]], ...] = ()
     """Of labels: names of the ids from 0 and their sRGB colours, where they are not those of the scene's materials."""
+    unit: str = field(default="", kw_only=True)
+    """Of its numbers; `WORLD_UNITS` of lengths, which maps with a scale have in metres."""
+    quantity: Literal["radiance", "reflectance"] | None = field(default=None, kw_only=True)
+    """What spectra are, as OpenEXR and ENVI files say it."""
+    centers_nm: tuple[float, ...] = field(default=(), kw_only=True)
+    """Centre of the band that each channel is; empty where channels are not single bands, or those of the scene."""
+    is_on_black: bool = field(default=False, kw_only=True)
+    """Whether it is light seen before black, which pictures say otherwise."""
+    nothing: int | None = field(default=None, kw_only=True)
+    """The number of pixels in which nothing is, where only that tells them; means of other programs leave it out."""
+    remarks: tuple[str, ...] = field(default=(), kw_only=True)
+    """What else is to be known of the numbers, for people."""
+
+    @property
+    def label_with_unit(self) -> str:
+        """What its numbers are."""
+        return f"{self.label} in {self.unit}" if self.unit else self.label
+
+    @property
+    def what(self) -> str:
+        """What its numbers are, in one line for people."""
+        return self.described(" on black")
+
+    def described(self, behind: str) -> str:
+        """The same of a picture with something else behind than black."""
+        return with_remarks(f"{self.label_with_unit}{behind if self.is_on_black else ''}", self.remarks)
+
+
+def with_remarks(label: str, remarks: Sequence[str]) -> str:
+    """A line for people.
+
+    >>> with_remarks("radiance", ("1 = full scale", "false colour"))
+    'radiance, 1 = full scale; false colour'
+    """
+    return "; ".join([", ".join([label, *remarks[:1]]), *remarks[1:]])
 
 
 AnyOutput = TypeVar("AnyOutput", bound=Output)

@@ -14,7 +14,6 @@ from unmix_plugin.scenes.placement import METRES_KEY
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.trained.camera_files import camera_entry
 from unmix_plugin.trained.run_views import RunView
-from unmix_plugin.trained.trained_scene import TrainedScene
 
 
 def export(job: Job, _: Poses) -> list[Path]:
@@ -23,7 +22,7 @@ def export(job: Job, _: Poses) -> list[Path]:
     job.claim([path])
     make_folder(job.folder)
     scene = job.loaded.scene
-    is_refined = isinstance(scene, TrainedScene) and "pose" in scene.fitted
+    is_refined = "pose" in scene.fitted
     content = _poses_json(scene.views, scene.frame, is_refined)
     if job.loaded.scale is not None:
         content[METRES_KEY] = job.loaded.scale.metres_per_unit

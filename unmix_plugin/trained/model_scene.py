@@ -7,7 +7,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor, nn
@@ -19,6 +19,8 @@ from unmix_plugin.engine.registry import Output, named_output
 from unmix_plugin.engine.runs.load_run import SceneRecord
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.scenes.scene import Normalisation
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.protocol import Probe, RenderableScene
 from unmix_plugin.trained.run_views import RunView, recorded_views, world_frame
 from unmix_plugin.trained.trained_scene import one_pixel
@@ -72,6 +74,10 @@ class ModelScene:
     views: tuple[RunView, ...]
     outputs: tuple[Output, ...]
     notes: tuple[str, ...] = ()
+    bands: Bands | None = None
+    materials: Materials | None = None
+    pixel_size: float | None = None
+    fitted: tuple[Literal["pose", "gain"], ...] = ()
 
     @property
     def scene_box(self) -> SceneBox:
@@ -82,6 +88,11 @@ class ModelScene:
     def device(self) -> torch.device:
         """Where it is rendered."""
         return self.model.device
+
+    @property
+    def lit_head_on(self) -> ModelScene:
+        """Itself: no lamp moves with the camera."""
+        return self
 
     def output(self, name: str) -> Output:
         """As the protocol has it."""
@@ -116,7 +127,10 @@ def model_scene(
 ) -> ModelScene:
     """The scene of a model, which must name outputs, as it is now; training that goes on does not change it."""
     if not model.outputs:
-        raise ConfigError(f"{type(model).__name__} names no outputs that could be shown")
+        raise ConfigError(
+            f"{type(model).__name__} names no outputs that could be shown: give its class `outputs`, a tuple of "
+            "unmix_plugin.engine.Output (docs/guides/plugins.md, What other methods get)"
+        )
     still = copy.deepcopy(model, frozen_parameters(model, averages)).eval()  # type: ignore[arg-type]
     return ModelScene(still, world_frame(record), recorded_views(record), still.outputs)
 

@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.registry import Output, OutputKind, no_output
+from unmix_plugin.engine.registry import WORLD_UNITS, Output, OutputKind, no_output
 from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import (
@@ -29,7 +29,7 @@ from unmix_plugin.spectral.colour.conversion import (
 )
 from unmix_plugin.spectral.features import FEWEST_BANDS, continuum_removed, derivative_matrix
 from unmix_plugin.spectral.materials import Coefficients, Materials
-from unmix_plugin.spectral.segmentation import material_scores
+from unmix_plugin.spectral.segmentation import NOTHING_ID, material_scores
 from unmix_plugin.spectral.subspace import PcaColours
 from unmix_plugin.trained.reflectance_maps import parse_reflectance_map
 
@@ -100,14 +100,19 @@ class MaterialView:
         return self.scene.output(name).compute(self)
 
 
+Capability: TypeAlias = Literal["light"]
+"""What a scene may lack that an output needs: a known light."""
+
+
 @dataclass(frozen=True)
 class MaterialOutput(Output):
-    """An output with its function."""
+    """An output of a scene of mixed materials, with its function."""
 
     compute: Callable[[MaterialView], Tensor] = field(kw_only=True)
     """From a rendered view to (H, W, ...)."""
-    centers_nm: tuple[float, ...] = field(default=(), kw_only=True)
-    """Of the bands that are chosen, one for each of its channels; empty where it is made of no single bands."""
+    needs: frozenset[Capability] = field(default=frozenset(), kw_only=True)
+    fewest_bands: int = field(default=1, kw_only=True)
+    """With light, that it takes."""
 
 
 def _linear_rgb(view: MaterialView) -> Tensor:
@@ -150,93 +155,190 @@ def _scores(view: MaterialView) -> Tensor:
 
 
 _UNIT = (0.0, 1.0)
-_DESCRIPTIONS = (
-    Output("rgb", "srgb", "colour", "sRGB on black, 0 to 1"),
-    Output("linear_rgb", "linear", "linear colour", "linear light in sRGB primaries on black, 0 to 1"),
-    Output("spectral", "channels", "spectra", "radiance on black, 1 = full scale"),
-    Output("diffuse", "channels", "diffuse part", "radiance without the view-dependent part, 1 = full scale"),
-    Output("specular", "channels", "specular part", "view-dependent part of the radiance, 1 = full scale"),
-    Output(
-        "reflectance",
-        "spectra",
-        "reflectance",
-        "radiance over the scene's light, 1 = as bright as white, shading included",
-    ),
-    Output(
-        "continuum",
-        "spectra",
-        "continuum removed",
-        "reflectance over its continuum, the upper convex hull, at most 1",
-    ),
-    Output("derivative", "spectra", "derivative", "derivative of the reflectance by wavelength, 1/nm"),
-    Output(
-        "second_derivative",
-        "spectra",
-        "second derivative",
-        "second derivative of the reflectance by wavelength, 1/nm^2",
-    ),
-    Output("abundances", "shares", "all abundances", "abundances, summing to the opacity", _UNIT),
-    Output("segmentation", "labels", "segmentation", "index of the material, 255 where nothing is"),
-    Output(
-        "confidence",
-        "map",
-        "segmentation confidence",
-        "estimated probability that the material is right",
-        _UNIT,
-    ),
-    Output(
-        "material_scores",
-        "shares",
-        "similarity to each endmember",
-        "cosine of the spectrum to each endmember",
-        _UNIT,
-    ),
-    Output(
-        "probe_probabilities",
-        "shares",
-        "probabilities of the probe",
-        "softmax over the endmembers of the cosine of the spectrum to each, as published",
-        _UNIT,
-    ),
-    Output(
-        "pca",
-        "picture",
-        "principal components",
-        "three principal components of the spectra, each stretched from its 1st to its 99th percentile",
-    ),
-    Output("depth", "map", "depth", "distance along the viewing axis in world units, 0 where nothing is"),
-    Output(
-        "ray_distance",
-        "map",
-        "distance along the ray",
-        "distance along the ray in world units, 0 where nothing is",
-    ),
-    Output("accumulation", "map", "opacity", "opacity, 0 to 1", _UNIT, "gray"),
-    Output("normals", "vectors", "normals", "unit normals in world axes, 0 where nothing is"),
-)
-_COMPUTE: dict[str, Callable[[MaterialView], Tensor]] = {
-    "rgb": lambda view: linear_to_srgb(_linear_rgb(view)),
-    "linear_rgb": _linear_rgb,
-    "spectral": lambda view: view.spectra,
-    "diffuse": lambda view: view.materials.diffuse(view.coefficients),
-    "specular": lambda view: view.materials.specular(view.coefficients),
-    "reflectance": _reflectance,
-    "continuum": _of_lit_bands(continuum_removed),
-    "derivative": _derivative(1),
-    "second_derivative": _derivative(2),
-    "abundances": lambda view: view.coefficients.abundances,
-    "segmentation": lambda view: view.materials.ids(view.coefficients),
-    "confidence": lambda view: view.materials.confidence(view.coefficients),
-    "material_scores": _scores,
-    "probe_probabilities": lambda view: torch.softmax(_scores(view), dim=-1),
-    "pca": _pca,
-    "depth": lambda view: view.depth,
-    "ray_distance": lambda view: view.ray_distance,
-    "accumulation": lambda view: view.opacity,
-    "normals": lambda view: view.normals,
-}
-OUTPUTS = {one.name: MaterialOutput(**vars(one), compute=_COMPUTE[one.name]) for one in _DESCRIPTIONS}
-"""All outputs that take no argument, in the order in which they are offered."""
+_FULL_SCALE = ("1 = full scale",)
+_NOTHING_IS_0 = ("0 where nothing is",)
+_NOTHING_IS_NAN = "NaN where nothing is"
+
+
+def _table() -> tuple[MaterialOutput, ...]:
+    """All outputs that take no argument, in the order in which they are offered; `{quantity}` is what spectra are."""
+    row = MaterialOutput
+    needs_light: frozenset[Capability] = frozenset({"light"})
+    return (
+        row(
+            "rgb",
+            "srgb",
+            "colour",
+            "sRGB",
+            is_on_black=True,
+            remarks=("0 to 1",),
+            compute=lambda view: linear_to_srgb(_linear_rgb(view)),
+        ),
+        row(
+            "linear_rgb",
+            "linear",
+            "linear colour",
+            "linear light in sRGB primaries",
+            is_on_black=True,
+            remarks=("0 to 1",),
+            compute=_linear_rgb,
+        ),
+        row(
+            "spectral",
+            "channels",
+            "spectra",
+            "{quantity}",
+            is_on_black=True,
+            remarks=_FULL_SCALE,
+            compute=lambda view: view.spectra,
+        ),
+        row(
+            "diffuse",
+            "channels",
+            "diffuse part",
+            "{quantity} without the view-dependent part",
+            remarks=_FULL_SCALE,
+            compute=lambda view: view.materials.diffuse(view.coefficients),
+        ),
+        row(
+            "specular",
+            "channels",
+            "specular part",
+            "view-dependent part of the {quantity}",
+            remarks=_FULL_SCALE,
+            compute=lambda view: view.materials.specular(view.coefficients),
+        ),
+        row(
+            "reflectance",
+            "spectra",
+            "reflectance",
+            "radiance over the scene's light",
+            needs=needs_light,
+            remarks=("1 = as bright as white, shading included", _NOTHING_IS_NAN),
+            compute=_reflectance,
+        ),
+        row(
+            "continuum",
+            "spectra",
+            "continuum removed",
+            "reflectance over its continuum, the upper convex hull",
+            remarks=("at most 1", _NOTHING_IS_NAN),
+            compute=_of_lit_bands(continuum_removed),
+        ),
+        row(
+            "derivative",
+            "spectra",
+            "derivative",
+            "derivative of the reflectance by wavelength",
+            unit="1/nm",
+            fewest_bands=FEWEST_BANDS,
+            remarks=(_NOTHING_IS_NAN,),
+            compute=_derivative(1),
+        ),
+        row(
+            "second_derivative",
+            "spectra",
+            "second derivative",
+            "second derivative of the reflectance by wavelength",
+            unit="1/nm^2",
+            fewest_bands=FEWEST_BANDS,
+            remarks=(_NOTHING_IS_NAN,),
+            compute=_derivative(2),
+        ),
+        row(
+            "abundances",
+            "shares",
+            "all abundances",
+            "abundances",
+            _UNIT,
+            remarks=("summing to the opacity",),
+            compute=lambda view: view.coefficients.abundances,
+        ),
+        row(
+            "segmentation",
+            "labels",
+            "segmentation",
+            "index of the material",
+            nothing=NOTHING_ID,
+            remarks=(f"{NOTHING_ID} where nothing is",),
+            compute=lambda view: view.materials.ids(view.coefficients),
+        ),
+        row(
+            "confidence",
+            "map",
+            "segmentation confidence",
+            "estimated probability that the material is right",
+            _UNIT,
+            compute=lambda view: view.materials.confidence(view.coefficients),
+        ),
+        row(
+            "material_scores",
+            "shares",
+            "similarity to each endmember",
+            "cosine of the spectrum to each endmember",
+            _UNIT,
+            compute=_scores,
+        ),
+        row(
+            "probe_probabilities",
+            "shares",
+            "probabilities of the probe",
+            "softmax over the endmembers of the cosine of the spectrum to each",
+            _UNIT,
+            remarks=("as published",),
+            compute=lambda view: torch.softmax(_scores(view), dim=-1),
+        ),
+        row(
+            "pca",
+            "picture",
+            "principal components",
+            "three principal components of the spectra",
+            remarks=("each stretched from its 1st to its 99th percentile",),
+            compute=_pca,
+        ),
+        row(
+            "depth",
+            "map",
+            "depth",
+            "distance along the viewing axis",
+            unit=WORLD_UNITS,
+            nothing=0,
+            remarks=_NOTHING_IS_0,
+            compute=lambda view: view.depth,
+        ),
+        row(
+            "ray_distance",
+            "map",
+            "distance along the ray",
+            "distance along the ray",
+            unit=WORLD_UNITS,
+            nothing=0,
+            remarks=_NOTHING_IS_0,
+            compute=lambda view: view.ray_distance,
+        ),
+        row(
+            "accumulation",
+            "map",
+            "opacity",
+            "opacity",
+            _UNIT,
+            "gray",
+            remarks=("0 to 1",),
+            compute=lambda view: view.opacity,
+        ),
+        row(
+            "normals",
+            "vectors",
+            "normals",
+            "unit normals in world axes",
+            remarks=_NOTHING_IS_0,
+            compute=lambda view: view.normals,
+        ),
+    )
+
+
+OUTPUTS = {one.name: one for one in _table()}
+"""By name."""
 
 
 @dataclass(frozen=True)
@@ -245,19 +347,12 @@ class _Family:
 
     kind: OutputKind
     title: str
-    needs: str
+    asks: str
     """What the argument is."""
     example: str
     make: Callable[[str, str, Materials], MaterialOutput]
     """From name, argument and materials to the output; raises a ConfigError where the argument can't be read, and a
     SpectrumError where the bands don't cover it."""
-
-
-def _made(
-    name: str, what: str, compute: Callable[[MaterialView], Tensor], centers_nm: tuple[float, ...]
-) -> MaterialOutput:
-    family = FAMILIES[name.partition(":")[0]]
-    return MaterialOutput(name, family.kind, family.title, what, compute=compute, centers_nm=centers_nm)
 
 
 def _shown_nm(bands: Bands, wavelengths_nm: Sequence[float]) -> tuple[tuple[float, ...], str]:
@@ -272,8 +367,17 @@ def _band(name: str, argument: str, materials: Materials) -> MaterialOutput:
     centers, shown = _shown_nm(materials.bands, [wavelength])
     band = materials.bands.nearest(wavelength)
     column = torch.eye(len(materials.bands))[:, band : band + 1]
-    what = f"{materials.quantity} of one band on black, 1 = full scale: {shown}"
-    return _made(name, what, lambda view: view.materials.through(view.coefficients, column)[..., 0], centers)
+    return MaterialOutput(
+        name,
+        "grey",
+        FAMILIES["band"].title,
+        f"{materials.quantity} of one band",
+        quantity=materials.quantity,
+        centers_nm=centers,
+        is_on_black=True,
+        remarks=(f"1 = full scale: {shown}",),
+        compute=lambda view: view.materials.through(view.coefficients, column)[..., 0],
+    )
 
 
 def _false_colour(name: str, argument: str, materials: Materials) -> MaterialOutput:
@@ -284,9 +388,16 @@ def _false_colour(name: str, argument: str, materials: Materials) -> MaterialOut
         )
     matrix = band_composite_matrix(materials.bands, wavelengths)
     centers, shown = _shown_nm(materials.bands, wavelengths)
-    what = f"three bands as red, green and blue, {materials.quantity} on black: {shown}"
-    return _made(
-        name, what, lambda view: view.materials.through(view.coefficients, matrix).clamp(0, 1), centers
+    return MaterialOutput(
+        name,
+        "linear",
+        FAMILIES["false-colour"].title,
+        f"three bands as red, green and blue, {materials.quantity}",
+        quantity=materials.quantity,
+        centers_nm=centers,
+        is_on_black=True,
+        remarks=(f"the bands: {shown}",),
+        compute=lambda view: view.materials.through(view.coefficients, matrix).clamp(0, 1),
     )
 
 
@@ -297,20 +408,28 @@ def _reflectance_map(name: str, _: str, materials: Materials) -> MaterialOutput:
             f"{materials.sensor}; leave out --sensor"
         )
     asked = parse_reflectance_map(name, materials.bands, materials.is_lit)
-    caveat = "" if materials.is_light_known else _OF_RADIANCE
-    undefined = "; NaN where undefined" if asked.kind == "map" else ""
+    undefined = ("NaN where undefined",) if asked.kind == "map" else ()
 
     def compute(view: MaterialView) -> Tensor:
         reflectance = view.materials.reflectance(view.coefficients)
         return asked.fit(reflectance[view.coefficients.is_occupied])(reflectance)
 
-    title, what = FAMILIES[name.partition(":")[0]].title, f"{asked.what}{caveat}{undefined}"
     return MaterialOutput(
-        name, asked.kind, title, what, asked.usual_range, classes=asked.classes, compute=compute
+        name,
+        asked.kind,
+        FAMILIES[name.partition(":")[0]].title,
+        asked.label,
+        asked.usual_range,
+        classes=asked.classes,
+        nothing=NOTHING_ID if asked.kind == "labels" else None,
+        remarks=(*asked.remarks, *_caveat(materials), *undefined),
+        compute=compute,
     )
 
 
-_OF_RADIANCE = "; of radiance, since the scene's light is unknown"
+def _caveat(materials: Materials) -> tuple[str, ...]:
+    """What is to be said of outputs that are made of reflectance."""
+    return () if materials.is_light_known else ("of radiance, since the scene's light is unknown",)
 
 
 def _wavelength_nm(text: str, name: str) -> float:
@@ -341,14 +460,14 @@ def find_output(name: str, materials: Materials) -> MaterialOutput:
         SpectrumError: the bands don't cover what it needs.
     """
     if name in OUTPUTS:
-        return _told(OUTPUTS[name], materials)
+        return _fitted(OUTPUTS[name], materials)
     prefix, _, argument = name.partition(":")
     family = FAMILIES.get(prefix)
     if family is None:
         examples = [family.example for family in FAMILIES.values()]
         raise no_output(name, [*OUTPUTS, *FAMILIES], [*OUTPUTS, *examples])
     if not argument:
-        raise ConfigError(f"the output {prefix} needs {family.needs}, as in {family.example}")
+        raise ConfigError(f"the output {prefix} needs {family.asks}, as in {family.example}")
     return family.make(name, argument, materials)
 
 
@@ -367,26 +486,30 @@ def available_outputs(materials: Materials) -> tuple[MaterialOutput, ...]:
     found = []
     for output in OUTPUTS.values():
         with suppress(SpectrumError):
-            found.append(_told(output, materials))
+            found.append(_fitted(output, materials))
     return tuple(found)
 
 
-def _told(output: MaterialOutput, materials: Materials) -> MaterialOutput:
-    """An output with the right words for its spectra, reflectance where a white is 1 in every band, else radiance, and
-    for its colours, where they are false."""
-    if output.kind in ("srgb", "linear") and colour_mode(materials.bands) == "false-colour":
-        return replace(output, what=f"{output.what}; {describe_colour(materials.bands)}")
-    if output.kind == "channels" and materials.quantity == "reflectance":
-        return replace(output, what=output.what.replace("radiance", "reflectance"))
-    if output.kind != "spectra":
-        return output
-    if output.name == "reflectance" and not materials.is_light_known:
+def _fitted(output: MaterialOutput, materials: Materials) -> MaterialOutput:
+    """An output that takes no argument, for these materials: with the quantity that their spectra are, reflectance
+    where a white is 1 in every band, else radiance, and remarks where colours are false or the light is unknown.
+
+    Raises:
+        SpectrumError: it needs a light that is unknown, or more bands with light.
+    """
+    if "light" in output.needs and not materials.is_light_known:
         raise SpectrumError(
             "the scene's light is unknown, so that it has no reflectance: process it with a white reference (--white), "
             "or name the light as illuminant_path in transforms.json"
         )
-    if output.name.endswith("derivative"):
-        lit_nm = materials.bands.centers_nm[materials.is_lit.cpu().numpy()]
-        derivative_matrix(lit_nm[:FEWEST_BANDS])  # which refuses fewer
-    caveat = "" if materials.is_light_known else _OF_RADIANCE
-    return replace(output, what=f"{output.what}; NaN where nothing is{caveat}")
+    lit_nm = materials.bands.centers_nm[materials.is_lit.cpu().numpy()]
+    if len(lit_nm) < output.fewest_bands:
+        derivative_matrix(lit_nm)  # which refuses fewer
+    more: tuple[str, ...] = ()
+    if output.kind in ("srgb", "linear") and colour_mode(materials.bands) == "false-colour":
+        more = (describe_colour(materials.bands),)
+    elif output.kind == "spectra":
+        more = _caveat(materials)
+    quantity = materials.quantity if output.kind == "channels" else None
+    label = output.label.replace("{quantity}", materials.quantity)
+    return replace(output, label=label, quantity=quantity, remarks=(*output.remarks, *more))

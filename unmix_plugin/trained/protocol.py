@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -19,6 +19,8 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.engine.registry import Output
 from unmix_plugin.scenes.scene import Normalisation
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.run_views import RunView
 
 
@@ -97,6 +99,32 @@ class RenderableScene(Protocol):
     @property
     def notes(self) -> tuple[str, ...]:
         """What a user has to be told of it."""
+        ...
+
+    @property
+    def bands(self) -> Bands | None:
+        """Of its spectra; None where it has none, or no wavelengths of them are known."""
+        ...
+
+    @property
+    def materials(self) -> Materials | None:
+        """Its endmembers and the light that they are seen in; None where it is not made of mixed materials."""
+        ...
+
+    @property
+    def pixel_size(self) -> float | None:
+        """Edge of a pixel of its views in the middle of the scene, model units; None where that is unknown."""
+        ...
+
+    @property
+    def fitted(self) -> tuple[Literal["pose", "gain"], ...]:
+        """What training found for each of its views."""
+        ...
+
+    @property
+    def lit_head_on(self) -> RenderableScene:
+        """The same scene as if a lamp that moves with the camera shone on every place head-on and cast no shadow, for
+        what no camera looks at from one place; itself without such a lamp."""
         ...
 
     @property

@@ -20,7 +20,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from unmix_plugin.engine.registry import OutputKind
+from unmix_plugin.engine.registry import OutputKind, with_remarks
 from unmix_plugin.errors import ConfigError, SpectrumError, counted
 from unmix_plugin.figures.plotting import distinct_colours, own_colours
 from unmix_plugin.formats.libraries import library_of, read_library
@@ -39,8 +39,8 @@ Score: TypeAlias = Callable[[Float[Tensor, "*rays B"]], Tensor]
 class ReflectanceMap:
     """An index, a target, an absorption or what is nearest in a library, for given bands."""
 
-    what: str
-    """One line: what its numbers are."""
+    label: str
+    """What its numbers are."""
     usual_range: tuple[float, float] | None
     """What pictures show; None: whatever range there is."""
     fit: Callable[[Float[Tensor, "N B"]], Score]
@@ -48,6 +48,13 @@ class ReflectanceMap:
     kind: OutputKind = "map"
     classes: tuple[tuple[str, tuple[float, ...]], ...] = ()
     """Names of ids and their sRGB colours, where the numbers are ids."""
+    remarks: tuple[str, ...] = ()
+    """What else is to be known of them, for people."""
+
+    @property
+    def what(self) -> str:
+        """What its numbers are, in one line for people."""
+        return with_remarks(self.label, self.remarks)
 
 
 def is_reflectance_map(name: str) -> bool:
@@ -76,15 +83,15 @@ def parse_reflectance_map(name: str, bands: Bands, lit: Bool[Tensor, "B"] | None
     return _PARSERS[kind](argument, bands, is_lit)
 
 
-def _left_out(lit: Bool[np.ndarray, " some"]) -> str:
-    """What a description says of bands that are left out for lack of light."""
+def _left_out(lit: Bool[np.ndarray, " some"]) -> tuple[str, ...]:
+    """What is to be said of bands that are left out for lack of light."""
     dark = len(lit) - int(lit.sum())
-    return f"; {dark} of {counted(len(lit), 'band')} left out: no light" if dark else ""
+    return (f"{dark} of {counted(len(lit), 'band')} left out: no light",) if dark else ()
 
 
 def _index(argument: str, bands: Bands, _: Bool[np.ndarray, " B"]) -> ReflectanceMap:
     index = parse_index(argument, bands)
-    return ReflectanceMap(index.what, index.usual_range, lambda _: index)
+    return ReflectanceMap(index.title, index.usual_range, lambda _: index, remarks=index.remarks)
 
 
 def _target(argument: str, bands: Bands, lit: Bool[np.ndarray, " B"]) -> ReflectanceMap:
@@ -96,7 +103,7 @@ def _target(argument: str, bands: Bands, lit: Bool[np.ndarray, " B"]) -> Reflect
         score = target.fit(background[:, chosen])
         return lambda spectra: score(spectra[..., chosen])
 
-    return ReflectanceMap(target.what + _left_out(lit), target.usual_range, fit)
+    return ReflectanceMap(target.what, target.usual_range, fit, remarks=_left_out(lit))
 
 
 _LIBRARY = re.compile(r"(?P<angle>angle:)?(?P<file>.+?)\s*(<\s*(?P<limit>\d+\.?\d*|\.\d+)\s*)?", re.DOTALL)
@@ -121,9 +128,11 @@ def _library(argument: str, bands: Bands, lit: Bool[np.ndarray, " B"]) -> Reflec
                 f"library:{argument}: the angle itself takes no threshold; leave out <{match['limit']}"
             )
         what = f"spectral angle in radians to the nearest spectrum of {name}: 0 = the same but for brightness"
-        what += _left_out(lit)
         return ReflectanceMap(
-            what, (0.0, 0.5), lambda _: lambda spectra: _nearest(library, bands, lit, spectra)[0]
+            what,
+            (0.0, 0.5),
+            lambda _: lambda spectra: _nearest(library, bands, lit, spectra)[0],
+            remarks=_left_out(lit),
         )
     if not 0 < limit <= np.pi:
         raise ConfigError(f"library:{argument}: the largest angle must lie between 0 and {np.pi:.4g} rad")
@@ -141,8 +150,9 @@ def _library(argument: str, bands: Bands, lit: Bool[np.ndarray, " B"]) -> Reflec
     classes = tuple(
         (name, tuple(colour)) for name, colour in zip(library.names, colours.tolist(), strict=True)
     )
-    what = f"nearest spectrum of {name} by its number, {NOTHING_ID} where none is within {limit:g} rad{_left_out(lit)}"
-    return ReflectanceMap(what, None, lambda _: ids, "labels", classes)
+    what = f"nearest spectrum of {name} by its number"
+    remarks = (f"{NOTHING_ID} where none is within {limit:g} rad", *_left_out(lit))
+    return ReflectanceMap(what, None, lambda _: ids, "labels", classes, remarks)
 
 
 def _nearest(
@@ -194,8 +204,8 @@ def _absorption(argument: str, bands: Bands, lit: Bool[np.ndarray, " B"]) -> Ref
     def score(spectra: Float[Tensor, "*rays B"]) -> Tensor:
         return absorption(spectra[..., chosen], window, measure).to(spectra.dtype)
 
-    what = f"{what}, {low:g} to {high:g} nm{_left_out(lit[within])}"
-    return ReflectanceMap(what, usual, lambda _: score)
+    remarks = (f"{low:g} to {high:g} nm", *_left_out(lit[within]))
+    return ReflectanceMap(what, usual, lambda _: score, remarks=remarks)
 
 
 _PARSERS: dict[str, Callable[[str, Bands, Bool[np.ndarray, " B"]], ReflectanceMap]] = {

@@ -179,10 +179,10 @@ def look_at(
     scene: TrainedScene, positions: Float[Tensor, "P 3"], directions: Float[Tensor, "P 3"]
 ) -> Coefficients:
     """What rays see that start a pixel's size before each point of a surface and go along these unit vectors; where
-    a lamp moves with the camera, `squarely_lit`."""
+    a lamp moves with the camera, `lit_head_on`."""
     indices = torch.zeros(len(positions), dtype=torch.int64)
     rays = RayBundle(positions - scene.pixel_size * directions, directions, indices).to(scene.device)
-    return scene.squarely_lit.renderer.composite(scene.field, rays)
+    return scene.lit_head_on.renderer.composite(scene.field, rays)
 
 
 def look_from_above(

@@ -136,8 +136,8 @@ class TrainedScene:
         return available_outputs(self.materials)
 
     @property
-    def squarely_lit(self) -> TrainedScene:
-        """The same scene as if a lamp that moves with the camera shone on every place squarely and cast no shadow, for
+    def lit_head_on(self) -> TrainedScene:
+        """The same scene as if a lamp that moves with the camera shone on every place head-on and cast no shadow, for
         what no camera looks at from one place: such a lamp stands where the camera says."""
         return replace(self, renderer=replace(self.renderer, opaque_skips=None))
 
@@ -183,7 +183,7 @@ class TrainedScene:
 
     @torch.no_grad()
     def probe_point(self, x: float, y: float, z: float) -> Probe:
-        """What a point of the world in the scene box is made of, lit squarely, without the view-dependent part."""
+        """What a point of the world in the scene box is made of, lit head-on, without the view-dependent part."""
         world = np.array([x, y, z], dtype=np.float64)
         place = self.frame.to_model(world)
         inside = torch.from_numpy(place).float()[None].to(self.device)

@@ -24,7 +24,6 @@ from unmix_plugin.spectral.library.material_library import MaterialLibrary, meas
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.model_scene import LightChoice, RelightableScene, relit
 from unmix_plugin.trained.run_views import recorded_views
-from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.page import number, paragraph, reporting_failures
 from unmix_plugin.viewer.recipes import RecipeHistory, numbered
 from unmix_plugin.viewer.rendering.captures import VideoQueue
@@ -81,7 +80,7 @@ class Services:
         with source.locked() as scene:
             for path in paths:
                 relit(scene, LightChoice(path), "of this run")
-            self.has_materials = isinstance(scene, TrainedScene)
+            self.has_materials = scene.materials is not None
             lights = scene.lights if isinstance(scene, RelightableScene) else ()
             self.lights: tuple[str, ...] = (*lights, *paths)
             """Names of the scene's lights, and the paths of those that a user gives."""

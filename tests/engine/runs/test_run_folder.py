@@ -275,15 +275,6 @@ def test_a_scene_of_another_shape_is_refused(trained, name):
         load_model(trained.path, "cpu")
 
 
-def test_a_grid_that_no_checkpoint_holds_is_refused_before_a_model_is_made(trained, monkeypatch):
-    rewrite(trained.scene_path, lambda scene: scene["metadata"].update(grid_resolution=512))
-    monkeypatch.setattr(RgbNerfConfig, "setup", lambda *_, **__: pytest.fail("a model was made"))
-    with pytest.raises(
-        RunError, match="a grid of 512 cells an edge has more numbers than its largest tensor"
-    ):
-        load_model(trained.path, "cpu")
-
-
 @pytest.mark.parametrize("name", ["config.json", "scene.json"])
 @pytest.mark.parametrize(
     "value", ["[" * 100 + "]" * 100, "[" * 200_000, "NaN", "1e999", '"\\u0000"', '"\\ud800"']

@@ -151,7 +151,7 @@ def test_heights_of_a_map_are_in_the_unit_of_its_coordinates_and_say_it(scale, u
 
 
 def test_more_than_a_tiff_can_hold_is_written_as_bigtiff(tmp_path, monkeypatch):
-    setting = files.RenderSetting(tmp_path, (4, 3), Palette.of(None, {}), None, {}, None)
+    setting = files.RenderSetting(tmp_path, (4, 3), Palette.of(None, {}), {}, {}, None)
     [depth] = choose_formats(["depth"], ["tif"], SCENE, False)
     values = np.arange(12, dtype=np.float32).reshape(3, 4)
     for limit, is_big in ((48, False), (47, True)):

@@ -44,7 +44,7 @@ _MOST_BYTES = 1 << 33
 """Of a checkpoint's tensors; the largest grids that settings allow take some gigabytes with the optimiser's state."""
 _JUDGED_TOGETHER = 1 << 20
 """Numbers of a tensor: to ask all of a large one at once takes its memory several times."""
-_MODEL, _OPTIMIZER, AVERAGE = "model/", "optimizer/", "average/"
+MODEL, _OPTIMIZER, AVERAGE = "model/", "optimizer/", "average/"
 
 
 @dataclass(frozen=True)
@@ -156,7 +156,7 @@ def _is_sound(name: str, tensor: Tensor) -> bool:
     is_small = tensor.is_floating_point() and tensor.element_size() == 1  # of which torch can't ask it
     for values in tensor.detach().reshape(-1).split(_JUDGED_TOGETHER):
         values = values.float() if is_small else values
-        is_sound = values.isnan().logical_not() if name.startswith(_MODEL) else values.isfinite()
+        is_sound = values.isnan().logical_not() if name.startswith(MODEL) else values.isfinite()
         if not is_sound.all():
             return False
     return True
@@ -257,7 +257,7 @@ def collect_tensors(
 ) -> dict[str, Tensor]:
     """The tensors of a checkpoint by name; they share memory with what is trained."""
     names = {id(param): name for name, param in model.named_parameters()}
-    tensors = {_MODEL + name: value for name, value in model.state_dict().items()}
+    tensors = {MODEL + name: value for name, value in model.state_dict().items()}
     for param, state in optimizer.state.items():
         for key, value in state.items():
             tensors[f"{_OPTIMIZER}{names[id(param)]}/{key}"] = value
@@ -285,7 +285,7 @@ def restore_model(tensors: Mapping[str, Tensor], model: nn.Module, averaged: boo
     """Give the model its values, with `averaged` those of the moving average where there is one. Raises RunError: the
     tensors do not fit the model."""
     try:
-        model.load_state_dict(part(tensors, _MODEL))
+        model.load_state_dict(part(tensors, MODEL))
         # After all of them: a parameter that modules share has several names, and an average under one.
         model.load_state_dict(part(tensors, AVERAGE) if averaged else {}, strict=False)
     except RuntimeError as error:

@@ -11,9 +11,11 @@ from unmix_plugin.engine.pipeline import Pipeline
 from unmix_plugin.engine.registry import find_method
 from unmix_plugin.engine.runs.atomic_files import read_run_json, write_run_json
 from unmix_plugin.engine.runs.checkpoints import (
+    MODEL,
     Checkpoint,
     TrainingRecord,
     newest_complete_checkpoint,
+    part,
     restore_model,
 )
 from unmix_plugin.engine.runs.config_json import config_from_json, config_to_json, flattened
@@ -58,7 +60,7 @@ def load_model(path: Path, device: str = "auto") -> LoadedModel:
     config = load_config(path)
     scene = read_scene_record(run, config.pipeline.datamanager.target)
     checkpoint = _newest_checkpoint(run)
-    _require_fitting_grid(scene, checkpoint)
+    _require_fitting_tensors(config, scene, checkpoint)
     try:
         model = config.pipeline.model.setup(scene_box=scene.scene_box, metadata=scene.metadata)
     except (UnmixError, LookupError, TypeError, ValueError, ArithmeticError) as error:
@@ -80,7 +82,7 @@ def load_pipeline(path: Path, device: str = "auto", data: Path | None = None) ->
     config = load_config(path)
     scene = read_scene_record(run, config.pipeline.datamanager.target)
     checkpoint = _newest_checkpoint(run)
-    _require_fitting_grid(scene, checkpoint)
+    _require_fitting_tensors(config, scene, checkpoint)
     config = config if data is None else replace(config, data=data)
     pipeline: Pipeline = config.pipeline.setup(data=require_data(config), device=place, seed=config.seed)
     check_same_scene(scene, pipeline.datamanager, run)
@@ -88,15 +90,14 @@ def load_pipeline(path: Path, device: str = "auto", data: Path | None = None) ->
     return LoadedPipeline(run, config, pipeline.eval(), scene, TrainingRecord.from_json(checkpoint.record))
 
 
-def _require_fitting_grid(scene: SceneRecord, checkpoint: Checkpoint) -> None:
-    """Refuse a grid that no tensor of the checkpoint is as large as, before memory is taken for it. Raises RunError."""
-    resolution = scene.metadata.get("grid_resolution")
-    largest = max((tensor.numel() for tensor in checkpoint.tensors.values()), default=0)
-    if isinstance(resolution, int) and resolution**3 > largest:
+def _require_fitting_tensors(config: TrainerConfig, scene: SceneRecord, checkpoint: Checkpoint) -> None:
+    """Refuse what a model would take too much memory for, before it is made. Raises RunError."""
+    try:
+        config.pipeline.model.target.check_tensors(scene.metadata, part(checkpoint.tensors, MODEL))
+    except (UnmixError, LookupError, TypeError, ValueError) as error:
         raise RunError(
-            f"the checkpoint does not fit the model that scene.json describes: a grid of {resolution} cells an edge "
-            f"has more numbers than its largest tensor, {largest:,}; train again"
-        )
+            f"the checkpoint does not fit the model that config and scene describe: {error}; train again"
+        ) from error
 
 
 def _newest_checkpoint(run: RunFolder) -> Checkpoint:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import torch
 from jaxtyping import Float
@@ -30,6 +30,7 @@ from unmix_plugin.neumatex.tracing.rays import PixelHits, RayMesh, pixel_hits
 from unmix_plugin.neumatex.tracing.surface import Surface
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.spectral.segmentation import material_ids
 from unmix_plugin.trained.model_scene import LightChoice, ModelView, frozen_parameters
 from unmix_plugin.trained.protocol import Probe
@@ -51,35 +52,82 @@ _DARKEST = 0.02
 """Base colour below which shading is not divided by it."""
 
 _COMMON = (
-    Output("rgb", "srgb", "colour", "sRGB on black, 0 to 1, with the tones of the pictures"),
-    Output("linear_rgb", "linear", "colour (linear)", "linear radiance on black"),
-    Output("base_colour", "linear", "base colour", "linear, 0 to 1, on black"),
+    Output(
+        "rgb",
+        "srgb",
+        "colour",
+        "sRGB",
+        is_on_black=True,
+        remarks=("0 to 1", "with the tones of the pictures"),
+    ),
+    Output("linear_rgb", "linear", "colour (linear)", "linear radiance", is_on_black=True),
+    Output(
+        "base_colour", "linear", "base colour", "linear base colour", is_on_black=True, remarks=("0 to 1",)
+    ),
 )
 _PBR = (
-    Output("roughness", "map", "roughness", "roughness, 0 to 1", (0.0, 1.0)),
-    Output("metallicity", "map", "metallicity", "metallicity, 0 to 1", (0.0, 1.0)),
+    Output("roughness", "map", "roughness", "roughness", (0.0, 1.0), remarks=("0 to 1",)),
+    Output("metallicity", "map", "metallicity", "metallicity", (0.0, 1.0), remarks=("0 to 1",)),
 )
 _LATENTS = (
     Output("latents_a", "picture", "latents A", "the decoder's latents 1 to 3 as red, green, blue"),
     Output("latents_b", "picture", "latents B", "the decoder's latents 4 to 6 as red, green, blue"),
 )
 _SPECTRAL = (
-    Output("spectral", "channels", "radiance", "radiance in every band, on black"),
-    Output("reflectance", "channels", "reflectance", "diffuse reflectance in every band, 0 to 1, on black"),
-    Output("abundances", "shares", "abundances", "share of each endmember, summing to opacity", (0.0, 1.0)),
-    Output("segmentation", "labels", "segmentation", "endmember of the largest share; 255 where nothing is"),
-    Output("roughness", "map", "roughness", "roughness of the gloss, 0 to 1", (0.0, 1.0)),
+    Output(
+        "spectral", "channels", "radiance", "radiance in every band", quantity="radiance", is_on_black=True
+    ),
+    Output(
+        "reflectance",
+        "channels",
+        "reflectance",
+        "diffuse reflectance in every band",
+        quantity="reflectance",
+        is_on_black=True,
+        remarks=("0 to 1",),
+    ),
+    Output(
+        "abundances",
+        "shares",
+        "abundances",
+        "share of each endmember",
+        (0.0, 1.0),
+        remarks=("summing to opacity",),
+    ),
+    Output(
+        "segmentation",
+        "labels",
+        "segmentation",
+        "endmember of the largest share",
+        nothing=255,
+        remarks=("255 where nothing is",),
+    ),
+    Output("roughness", "map", "roughness", "roughness of the gloss", (0.0, 1.0), remarks=("0 to 1",)),
     Output(
         "specular_level", "map", "specular level", "root of what the gloss reflects straight on", (0.0, 1.0)
     ),
 )
 _UNCERTAINTY = Output(
-    "uncertainty", "map", "uncertainty", "expected error of the material's parameters, mean", None, "magma"
+    "uncertainty",
+    "map",
+    "uncertainty",
+    "expected error of the material's parameters",
+    None,
+    "magma",
+    remarks=("mean",),
 )
 _GEOMETRY = (
-    Output("shading", "linear", "shading", "light divided by base colour, on black"),
-    Output("normals", "vectors", "normals", "unit vectors in world axes, 0 where nothing is"),
-    Output("depth", "map", "depth", "distance along the viewing axis in world units, 0 where nothing is"),
+    Output("shading", "linear", "shading", "light divided by base colour", is_on_black=True),
+    Output("normals", "vectors", "normals", "unit vectors in world axes", remarks=("0 where nothing is",)),
+    Output(
+        "depth",
+        "map",
+        "depth",
+        "distance along the viewing axis",
+        unit="world units",
+        nothing=0,
+        remarks=("0 where nothing is",),
+    ),
     Output("accumulation", "map", "opacity", "part of the pixel that the mesh covers", (0.0, 1.0)),
 )
 
@@ -110,6 +158,11 @@ class TrainedObject:
     lamp: Float[Tensor, " B"] | None = None
     """Spectrum that environments in colours get; None for colours."""
 
+    materials: Materials | None = None
+    """None: its endmembers are those of a surface, not of a volume."""
+    pixel_size: float | None = None
+    fitted: tuple[Literal["pose", "gain"], ...] = ()
+
     @property
     def mesh(self) -> Mesh:
         """In model space."""
@@ -119,6 +172,11 @@ class TrainedObject:
     def device(self) -> torch.device:
         """Where it is rendered."""
         return self.ray_mesh.device
+
+    @property
+    def lit_head_on(self) -> TrainedObject:
+        """Itself: no lamp moves with the camera."""
+        return self
 
     @property
     def outputs(self) -> tuple[Output, ...]:

@@ -18,7 +18,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 
-from unmix_plugin.engine.registry import Output, OutputKind
+from unmix_plugin.engine.registry import METRES, WORLD_UNITS, Output, OutputKind
 from unmix_plugin.errors import ConfigError, did_you_mean
 from unmix_plugin.figures.pictures import Canvas, CanvasLayout
 from unmix_plugin.formats.envi import envi_cube_paths, envi_cube_rows
@@ -37,9 +37,7 @@ from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import rgb_matrix
 from unmix_plugin.spectral.maps.indices import NAMED_INDICES
 from unmix_plugin.spectral.segmentation import NOTHING_ID
-from unmix_plugin.trained.outputs import MaterialOutput
 from unmix_plugin.trained.protocol import RenderableScene
-from unmix_plugin.trained.trained_scene import TrainedScene
 
 _Format = Literal["envi", "exr", "npy", "png", "mp4", "tif"]
 _FORMATS: tuple[_Format, ...] = get_args(_Format)
@@ -113,7 +111,7 @@ def file_name(output: Output) -> str:
 def needs_legend(formatted: FormattedOutput, scene: RenderableScene) -> bool:
     """Whether an output's pictures have colours that have to be explained, and that can be."""
     kind = formatted.output.kind
-    has_meaning = kind in ("map", "shares") or (kind == "labels" and isinstance(scene, TrainedScene))
+    has_meaning = kind in ("map", "shares") or (kind == "labels" and scene.materials is not None)
     return formatted.format in ("png", "mp4") and has_meaning
 
 
@@ -169,16 +167,14 @@ def choose_formats(
     return tuple(found)
 
 
-IN_METRES = "in metres"
-"""Words of an output whose numbers are lengths, where they are not in units of the world."""
-
-
 def with_units(outputs: Sequence[FormattedOutput], info: MapInfo | None) -> tuple[FormattedOutput, ...]:
     """The outputs of a map, whose lengths are metres as its coordinates are, or of other views."""
     if info is None or not info.is_metric:
         return tuple(outputs)
-    told = [replace(one.output, what=one.output.what.replace("in world units", IN_METRES)) for one in outputs]
-    return tuple(one._replace(output=output) for one, output in zip(outputs, told, strict=True))
+    return tuple(
+        one._replace(output=replace(one.output, unit=METRES)) if one.output.unit == WORLD_UNITS else one
+        for one in outputs
+    )
 
 
 def _require_tifffile() -> Any:
@@ -232,8 +228,8 @@ class RenderSetting:
     size: tuple[int, int]
     """Width and height of a view in pixels."""
     palette: Palette
-    bands: Bands | None
-    """Of outputs of kind `channels`; None where the scene has no spectra."""
+    bands: dict[str, Bands]
+    """Of each output whose channels are bands."""
     channels: dict[str, tuple[str, ...]]
     """Names of the channels of each output that has several."""
     frames_per_second: float | None = None
@@ -348,12 +344,12 @@ def _envi(output: Output, path: Path, setting: RenderSetting) -> Iterator[RowsSi
     width, height = setting.size
     names = setting.channels.get(output.name, (output.name,))
     shape = (height, width, len(names))
-    bands = setting.bands if output.kind in ("channels", "spectra") else None
+    bands = setting.bands.get(output.name)
     description = setting.described(output)
     more = {} if setting.map_info is None else dict(setting.map_info.envi)
-    if (nothing := _nothing(output)) is not None:
-        more["data ignore value"] = nothing
-    if isinstance(output, MaterialOutput) and output.centers_nm:
+    if output.nothing is not None:
+        more["data ignore value"] = output.nothing
+    if bands is None and output.centers_nm:
         # In the order of the channels, which for a false colour is seldom that of bands.
         more |= {"wavelength units": "Nanometers", "wavelength": output.centers_nm}
     with envi_cube_rows(path.with_suffix(""), shape, bands, list(names), description, more) as add:
@@ -362,17 +358,10 @@ def _envi(output: Output, path: Path, setting: RenderSetting) -> Iterator[RowsSi
 
 def _wavelengths(output: Output, setting: RenderSetting) -> tuple[Sequence[float], Sequence[float]]:
     """Centre of each channel, nm, where each is one band, and the widths where they are known."""
-    if output.kind in ("channels", "spectra") and setting.bands is not None:
-        widths = setting.bands.fwhm_nm
-        return setting.bands.centers_nm.tolist(), () if widths is None else widths.tolist()
-    return (output.centers_nm if isinstance(output, MaterialOutput) else ()), ()
-
-
-def _nothing(output: Output) -> int | None:
-    """The number of pixels in which nothing is, where only that tells them: means of other programs leave it out."""
-    if output.kind == "labels":
-        return NOTHING_ID
-    return 0 if output.name in ("depth", "ray_distance") else None
+    bands = setting.bands.get(output.name)
+    if bands is None:
+        return output.centers_nm, ()
+    return bands.centers_nm.tolist(), () if bands.fwhm_nm is None else bands.fwhm_nm.tolist()
 
 
 @contextmanager
@@ -382,8 +371,8 @@ def _tif(output: Output, path: Path, setting: RenderSetting) -> Iterator[RowsSin
     yield add
     buffer, info = io.BytesIO(), setting.map_info
     tags = [] if info is None else info.geotiff
-    if (nothing := _nothing(output)) is not None:
-        tags.append((_GDAL_NODATA, 2, len(str(nothing)) + 1, str(nothing), True))
+    if output.nothing is not None:
+        tags.append((_GDAL_NODATA, 2, len(str(output.nothing)) + 1, str(output.nothing), True))
     names = list(setting.channels.get(output.name, (output.name,)))
     tags.append(gdal_metadata(names, *_wavelengths(output, setting)))
     # Which band is red, green and blue; or the colour of each id.
@@ -414,13 +403,13 @@ def _exr(output: Output, path: Path, setting: RenderSetting) -> Iterator[RowsSin
     add, planes, opacity = _whole(output, setting)
     yield add
     comments = setting.described(output)
-    if output.kind == "channels" and setting.bands is not None:
-        to_rgb = rgb_matrix(setting.bands).numpy()
+    bands = setting.bands.get(output.name)
+    if output.kind == "channels" and bands is not None:
+        to_rgb = rgb_matrix(bands).numpy()
         rows = (np.clip(row, 0, None).T @ to_rgb for row in planes.swapaxes(0, 1))
         preview = np.stack([np.clip(row, 0, 1) for row in rows])
-        quantity = "reflectance" if "reflectance" in output.what else "radiance"
         spectra = np.moveaxis(planes, 0, -1)
-        write_spectral_exr(path, spectra, setting.bands, preview, opacity, comments, quantity)
+        write_spectral_exr(path, spectra, bands, preview, opacity, comments, output.quantity or "radiance")
         return
     pixels = dict(zip(_exr_names(output, setting), planes, strict=True))
     write_exr(path, {**pixels, "A": opacity} if output.kind == "linear" else pixels, {"comments": comments})

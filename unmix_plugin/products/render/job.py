@@ -22,13 +22,12 @@ from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.processes import ALONE, Processes
-from unmix_plugin.engine.registry import Output
+from unmix_plugin.engine.registry import METRES, Output
 from unmix_plugin.figures.pictures import ColourScale
 from unmix_plugin.formats.video import FrameSink
 from unmix_plugin.products.render.cameras import RenderCameras
 from unmix_plugin.products.render.files import (
     COVERAGE,
-    IN_METRES,
     FormattedOutput,
     RenderSetting,
     Rows,
@@ -48,7 +47,7 @@ from unmix_plugin.trained.outputs import usual_range
 from unmix_plugin.trained.protocol import RenderableScene
 from unmix_plugin.trained.reflectance_maps import Score, is_reflectance_map, parse_reflectance_map
 from unmix_plugin.trained.run_views import RunView
-from unmix_plugin.trained.trained_scene import TrainedScene, one_pixel
+from unmix_plugin.trained.trained_scene import one_pixel
 
 _MOST_VIEWS = 12
 _PIXELS = 32 * 32
@@ -85,17 +84,17 @@ def take_survey(
     maps = [output for output in outputs if is_reflectance_map(output.name)]
     ranged = [output for output in outputs if _is_ranged(output) and output not in maps]
     has_pca = any(output.name == "pca" for output in outputs)
-    is_mixed = isinstance(scene, TrainedScene)
-    spectra = ["spectral"] if is_mixed and (maps or has_pca) else []
+    materials = scene.materials
+    spectra = ["spectral"] if materials is not None and (maps or has_pca) else []
     seen = _seen(scene, views, [*(output.name for output in ranged), *spectra])
     scales = {
         output.name: scale_of(output, *usual_range(seen[output.name] * _units(output, info)))
         for output in ranged
     }
-    if not is_mixed or not spectra:
+    if materials is None or not spectra:
         return Survey(scales)
-    reflectance = scene.materials.reflectance_of(seen["spectral"], seen["accumulation"])
-    bands, lit = scene.bands, scene.materials.is_lit
+    reflectance = materials.reflectance_of(seen["spectral"], seen["accumulation"])
+    bands, lit = materials.bands, materials.is_lit
     scores = {output.name: parse_reflectance_map(output.name, bands, lit).fit(reflectance) for output in maps}
     for output in maps:
         if output.value_range is None and output.kind == "map":
@@ -105,13 +104,13 @@ def take_survey(
 
 def _lit_for(scene: RenderableScene, info: MapInfo | None) -> RenderableScene:
     """The scene as it is shown: rays of a map start from many places, so that no lamp can go with them."""
-    return scene.squarely_lit if info is not None and isinstance(scene, TrainedScene) else scene
+    return scene if info is None else scene.lit_head_on
 
 
 def _units(output: Output, info: MapInfo | None) -> float:
     """What an output's numbers are multiplied with to be in the unit that it says."""
     metres = None if info is None else info.metres_per_unit
-    return 1.0 if metres is None or IN_METRES not in output.what else metres
+    return 1.0 if metres is None or output.unit != METRES else metres
 
 
 def _is_ranged(output: Output) -> bool:
@@ -252,8 +251,8 @@ class RenderJob:
         if self._survey.pca is not None:
             seen = (opacity > OCCUPIED_ACCUMULATION)[..., None]
             rendered["pca"] = self._survey.pca(rendered["spectral"].cpu()) * seen.cpu()
-        if self._survey.scores and isinstance(self._scene, TrainedScene):
-            reflectance = self._scene.materials.reflectance_of(rendered["spectral"].cpu(), opacity.cpu())
+        if self._survey.scores and (materials := self._scene.materials) is not None:
+            reflectance = materials.reflectance_of(rendered["spectral"].cpu(), opacity.cpu())
             rendered |= {name: score(reflectance) for name, score in self._survey.scores.items()}
         return {name: values.detach().cpu().numpy() for name, values in rendered.items()}
 
@@ -277,17 +276,17 @@ def setting_for(
 ) -> RenderSetting:
     """What files of views share that are as large as those of a camera; a scene without materials is asked how many
     channels an output has."""
-    materials = scene.materials if isinstance(scene, TrainedScene) else None
-    bands = getattr(scene, "bands", None)
-    bands = bands if isinstance(bands, Bands) else None
-    names: dict[str, tuple[str, ...]] = {}
+    materials, names, bands = scene.materials, dict[str, tuple[str, ...]](), dict[str, Bands]()
     for output in outputs:
         if output.kind in ("grey", "map", "labels"):
             continue
         if output.kind not in ("channels", "spectra", "shares"):
             names[output.name] = ("x", "y", "z") if output.kind == "vectors" else ("red", "green", "blue")
-        elif output.kind in ("channels", "spectra") and bands is not None:
-            names[output.name] = tuple(f"{wavelength:g} nm" for wavelength in bands.centers_nm)
+            continue
+        of_output = Bands.of(output.centers_nm) if output.centers_nm else scene.bands
+        if output.kind != "shares" and of_output is not None:
+            bands[output.name] = of_output
+            names[output.name] = tuple(f"{wavelength:g} nm" for wavelength in of_output.centers_nm)
         elif materials is None:
             pixel = scene.render(one_pixel(camera, 0, 0), [output.name])[output.name]
             names[output.name] = tuple(f"{output.title} {index}" for index in range(pixel.shape[-1]))

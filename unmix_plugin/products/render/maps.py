@@ -27,7 +27,6 @@ from unmix_plugin.errors import ConfigError
 from unmix_plugin.trained.camera_files import check_size
 from unmix_plugin.trained.measures import Scale
 from unmix_plugin.trained.protocol import RenderableScene
-from unmix_plugin.trained.trained_scene import TrainedScene
 
 _DIRECTIONS = {
     "top": (0.0, 0.0, 1.0),
@@ -176,7 +175,7 @@ def map_camera(
     flat = frame.to_world(corners) @ axes.T * metres
     low, high = flat.min(axis=0), flat.max(axis=0)
     if pixel_size is None:
-        own = scene.pixel_size * metres / frame.scale if isinstance(scene, TrainedScene) else None
+        own = None if scene.pixel_size is None else scene.pixel_size * metres / frame.scale
         pixel_size = own or float((high - low)[:2].max()) / _USUAL_PIXELS
         pixel_size = float(f"{pixel_size:.2g}")
     if not 0 < pixel_size < math.inf:

@@ -8,7 +8,6 @@ Notation: `h x W` pixels, some rows of an image; `T` tiles, `K` endmembers.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -75,7 +74,7 @@ class Palette:
     def describe(self, output: Output, is_opaque: bool = False) -> str:
         """What an output's colours mean, in pictures with opacity or in opaque ones, over the neutral grey."""
         behind = " on light grey" if is_opaque else ", transparent where nothing is"
-        what = output.what.replace(" on black", behind)
+        what = output.described(behind)
         scale = self.scale(output)
         if scale is None:
             return what
@@ -84,7 +83,7 @@ class Palette:
 
 def scale_of(output: Output, low: float, high: float) -> ColourScale:
     """The output's colour map between two values."""
-    return ColourScale(output.colour_map, low, high, re.split("[,;]", output.what)[0])
+    return ColourScale(output.colour_map, low, high, output.label_with_unit)
 
 
 def opaque_tiles(

@@ -201,12 +201,20 @@ class _SpectralIndex:
 
     name: str
     """Of a named index, otherwise the formula as it was written."""
-    what: str
-    """One line: full name, formula and source, and the bands it is computed from."""
+    title: str
+    """Full name."""
+    remarks: tuple[str, ...]
+    """Formula and source of a named index, and the bands that it is computed from."""
     usual_range: tuple[float, float] | None
     """Values that pictures spread their colours over; None for a formula, of which nothing is known."""
     bands: Bands
     formula: _Formula
+
+    @property
+    def what(self) -> str:
+        """Title and remarks in one line."""
+        *formula, bands = self.remarks
+        return f"{', '.join([self.title, *formula])}; {bands}"
 
     def __call__(self, reflectance: Float[Tensor, "*rays B"]) -> Float[Tensor, "*rays"]:
         """The index of each spectrum; NaN where any part of the formula is undefined, as in 0/0, or overflows."""
@@ -250,9 +258,11 @@ def parse_index(text: str, bands: Bands) -> _SpectralIndex:
         formula = parse_formula(on_bands)
     used = {index for nm in formula.wavelengths_nm for index in _neighbours(nm, bands)[:2]}
     centres = _listed(float(bands.centers_nm[index]) for index in sorted(used))
-    title = f"{named.title}, {formula.text} ({named.source})" if named else f"formula {formula.text}"
-    what = f"{' '.join(title.split())}; from the bands at {centres} nm"
-    return _SpectralIndex(name, what, named.usual_range if named else None, bands, formula)
+    text, seen_in = " ".join(formula.text.split()), f"from the bands at {centres} nm"
+    if named is None:
+        return _SpectralIndex(name, f"formula {text}", (seen_in,), None, bands, formula)
+    remarks = (f"{text} ({named.source})", seen_in)
+    return _SpectralIndex(name, named.title, remarks, named.usual_range, bands, formula)
 
 
 def available_indices(bands: Bands) -> list[str]:

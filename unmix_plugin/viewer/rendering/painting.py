@@ -38,7 +38,6 @@ from unmix_plugin.spectral.segmentation import NOTHING_ID
 from unmix_plugin.trained.outputs import FAMILIES, OUTPUTS, MaterialView, usual_range
 from unmix_plugin.trained.protocol import RenderableScene, RenderedView
 from unmix_plugin.trained.reflectance_maps import parse_reflectance_map
-from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.page import BLOCK_STYLE, paragraph, swatches
 from unmix_plugin.viewer.rendering.aids import LayerAids
 from unmix_plugin.viewer.rendering.settings import (
@@ -372,7 +371,7 @@ LAYERS: dict[str, _Layer] = {
 
 def layers_of(scene: RenderableScene) -> dict[str, _Layer]:
     """All that can be shown of a scene, by name: what its materials allow, and its outputs that can be painted."""
-    if not isinstance(scene, TrainedScene):
+    if scene.materials is None:
         return {output.name: _layer_of(output) for output in scene.outputs if output.kind in _PAINTED_KINDS}
     others = (output for output in scene.outputs if output.kind in ("map", "vectors"))
     return {**LAYERS, **{output.name: _layer_of(output) for output in others if output.name not in LAYERS}}

@@ -243,9 +243,9 @@ class PictureMaker:
         with source.locked() as scene:
             self.layers = layers_of(scene)
             """What can be shown, by name."""
-            is_mixed = isinstance(scene, TrainedScene)
             self.aids = SceneAids(source)
-            numbers = _num_channels(scene.materials) if is_mixed else 4 * len(scene.outputs)
+            materials = scene.materials
+            numbers = 4 * len(scene.outputs) if materials is None else _num_channels(materials)
         self._largest_pixels = max(256, LARGEST_FRAME_BYTES // (4 * numbers))
 
     def first_render(self, pose: ViewPose, largest_height: int) -> FrameRender:
