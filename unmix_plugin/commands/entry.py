@@ -253,6 +253,10 @@ def _verdict(error: Exception) -> tuple[str, int]:
     if is_of_memory or _OUT_OF_MEMORY.search(text):
         reason = str(error).strip().splitlines() or ["no more to be had"]
         return f"error: out of memory: {reason[0]}. {_MEMORY_ADVICE}", USER_ERROR
+    from unmix_plugin.engine.registry import plugin_at_fault
+
+    if (place := plugin_at_fault(error)) is not None:
+        return f"error in the plugin {place}: {text}. --debug shows how it was called", INTERNAL_ERROR
     return f"this is a bug in unmix-nerf, please report it with what --debug shows: {text}", INTERNAL_ERROR
 
 

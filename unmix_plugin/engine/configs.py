@@ -7,6 +7,7 @@ so that the help of a command is quick.
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
@@ -58,8 +59,23 @@ class InstantiateConfig:
         return getattr(import_module(module), name)
 
     def setup(self, **kwargs: Any) -> Any:
-        """The configured object: `target(self, **kwargs)`."""
-        return self.target(self, **kwargs)
+        """The configured object: `target(self, **kwargs)`. Raises ConfigError: the class lacks methods that it must
+        have."""
+        target = self.target
+        if missing := sorted(getattr(target, "__abstractmethods__", ())):
+            raise ConfigError(
+                f"{place_of(target)} has no {' and no '.join(missing)}: a method must write them itself"
+            )
+        return target(self, **kwargs)
+
+
+def place_of(kind: type) -> str:
+    """A class, and where it is written, for messages about what it does."""
+    try:
+        place = f" ({inspect.getsourcefile(kind)}:{inspect.getsourcelines(kind)[1]})"
+    except (OSError, TypeError):  # made by a program
+        place = ""
+    return f"{kind.__module__}.{kind.__qualname__}{place}"
 
 
 def require_in_range(name: str, value: int | float, low: int | float, high: int | float) -> None:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Literal, TypeVar
 
-from unmix_plugin.engine.configs import TrainerConfig
+from unmix_plugin.engine.configs import TrainerConfig, place_of
 from unmix_plugin.errors import ConfigError, did_you_mean
 
 METHOD_GROUP = "unmix_plugin.method_configs"
@@ -76,6 +77,25 @@ def discover_methods() -> tuple[dict[str, MethodSpecification], list[BrokenPlugi
         else:
             methods[found.name] = found
     return methods, broken
+
+
+def plugin_at_fault(error: BaseException) -> str | None:
+    """Where an error left the code of somebody's plugin, as the plugin, file and line, or where a method of ours that a
+    class of a plugin inherits calls it; None where none was running."""
+    packages = {_package(entry.value) for entry in entry_points(group=METHOD_GROUP)} - {_package(__name__)}
+    found = None
+    for frame, line in traceback.walk_tb(error.__traceback__):
+        package, kind = _package(frame.f_globals.get("__name__", "")), type(frame.f_locals.get("self"))
+        if package in packages:
+            found = f"{package} ({frame.f_code.co_filename}:{line}, in {frame.f_code.co_name})"
+        elif found is None and _package(kind.__module__) in packages:
+            found = f"{_package(kind.__module__)} ({place_of(kind)})"
+    return found
+
+
+def _package(name: object) -> str:
+    """The package that a module, or what is called MODULE:NAME, is of."""
+    return str(name).partition(":")[0].partition(".")[0]
 
 
 def find_method(name: str) -> MethodSpecification:

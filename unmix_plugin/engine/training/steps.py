@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from unmix_plugin.engine.configs import OptimizerConfig, TrainerConfig
+from unmix_plugin.engine.configs import OptimizerConfig, TrainerConfig, place_of
 from unmix_plugin.engine.machine import resolve_device, seed_everything
 from unmix_plugin.engine.model import TrainingCallbackLocation, run_callbacks
 from unmix_plugin.engine.pipeline import Pipeline
@@ -148,7 +148,8 @@ class TrainingSteps:
         num_rays = datamanager.get_train_rays_per_batch()
         self.learning_rates = set_learning_rates(self.optimizer, self.configs, progress)
         outputs, losses, metrics = pipeline.get_train_loss_dict(step)
-        total = torch.stack(list(losses.values())).sum()
+        _require_losses(losses, type(pipeline.model))
+        total = torch.stack([loss.reshape(()) for loss in losses.values()]).sum()
         self.optimizer.zero_grad(set_to_none=True)
         total.backward()
         wanted = pipeline.model.next_num_rays(outputs, num_rays)
@@ -172,6 +173,27 @@ class TrainingSteps:
         rays = total.new_tensor(float("nan") if wanted is None else float(wanted))
         total, rays = self.processes.average_gradients(parameters, [total, rays])
         return total, None if wanted is None else max(1, int(rays))
+
+
+def _require_losses(losses: Mapping[str, Tensor], kind: type) -> None:
+    """Refuse losses of a model of this class that can't be added up. Raises ConfigError: naming the class and where it
+    is written."""
+    if not losses:
+        raise ConfigError(
+            f"get_loss_dict of {place_of(kind)} gives no loss: training has nothing to make smaller"
+        )
+    for name, loss in losses.items():
+        found = f"a {type(loss).__name__}"
+        if isinstance(loss, Tensor):
+            found = f"a tensor of the shape {tuple(loss.shape)}"
+        if not isinstance(loss, Tensor) or loss.numel() != 1:
+            raise ConfigError(
+                f"the loss {name} of {place_of(kind)} is {found}; expected a tensor of one number, as mean() gives"
+            )
+    if not any(loss.requires_grad for loss in losses.values()):
+        raise ConfigError(
+            f"no loss of {place_of(kind)} depends on a parameter: is something detached, or made under no_grad?"
+        )
 
 
 def prepare_steps(config: TrainerConfig, processes: Processes = ALONE) -> tuple[TrainerConfig, TrainingSteps]:
