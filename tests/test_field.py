@@ -8,7 +8,7 @@ from torch.testing import assert_close
 
 from tests.method_factory import BOX, CONFIG
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.field import UnmixField
+from unmix_plugin.field import FieldSpace, UnmixField
 from unmix_plugin.light.shading import direction_features
 from unmix_plugin.settings import UnmixFieldConfig
 
@@ -17,11 +17,16 @@ PIXELS = (0.02, 0.01, 0.006, 0.0045, 0.003, 0.001)
 
 
 def make_field(
-    num_specular: int = 2, scale: str = "shared", temperature: float = 1.0, **settings
+    num_specular: int = 2,
+    scale: str = "shared",
+    temperature: float = 1.0,
+    coarse_to_fine: bool = False,
+    **settings,
 ) -> UnmixField:
     torch.manual_seed(0)
     config = replace(CONFIG.field, scale=scale, temperature=temperature)
-    field = UnmixField(config, BOX, 3, num_specular, initial_density=2.0, pixel_size=0.087, **settings)
+    space = FieldSpace(BOX, 2.0, 0.087, coarse_to_fine=coarse_to_fine)
+    field = UnmixField(config, space, 3, num_specular, **settings)
     torch.nn.init.normal_(field.table)
     torch.nn.init.normal_(field.material_network[-1].weight)  # pyright: ignore[reportArgumentType]
     return field

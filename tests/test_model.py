@@ -117,7 +117,7 @@ def occupied_after_training(has_alpha: bool = True, visible_weight: float | str 
         step = model.training_batch(bundle, from_batch(batch, 2000, model.seen_by.num_channels))
         model.losses(step)
         assert int(model.grid.visibility.num_rays) == 0
-        model.learn_from(step)
+        model.update(step)
         model.get_training_callbacks()[0].func(0, 0.0)
     return model.grid.occupied.float().mean(dim=(0, 1)).flip(0)
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -41,8 +42,9 @@ _LARGEST_LOG_DENSITY = 15.0
 NUM_FEATURES = 15
 """Geometry features that the heads see."""
 _BRIGHTEST = 8.0
-"""Of gloss, in the brightness at which a sensor saturates: a lamp that fills a small part of a pixel saturates all of
-it. And of a sky, in that of its endmembers, which are near its mean: what is brighter must not wait at the limit."""
+"""Of specular reflection, in the brightness at which a sensor saturates: a lamp that fills a small part of a pixel
+saturates all of it. And of a sky, in that of its endmembers, which are near its mean: what is brighter must not wait at
+the limit."""
 _SPECULAR_BIAS = -3.0 - math.log(_BRIGHTEST)
 """Logit of the view-dependent part at the start; low, so that colour is first explained by materials."""
 
@@ -70,7 +72,7 @@ class CoefficientField(Field):
     ) -> dict[str, Tensor]:
         """`abundances` (S, K), `scaled_abundances` (S, K) and `specular_coefficients` (S, J) along `directions`, in the
         `light` that reaches each sample of `moving_lamp`; None where there is no such lamp, or to see all places as if
-        it shone on them squarely, without gloss."""
+        it shone on them head-on, without specular reflection."""
 
     @abstractmethod
     def encode(
@@ -94,100 +96,90 @@ class CoefficientField(Field):
         return self.density_of(self.encode(positions))
 
 
-class UnmixField(CoefficientField):
-    """Density, abundances, scales and specular coefficients of points in a scene box."""
+@dataclass(frozen=True)
+class FieldSpace:
+    """Where a field is defined, and how it is before training."""
+
+    box: SceneBox
+    """The scene box, model space."""
+    initial_density: float
+    """Density of the untrained field, per scene unit."""
+    pixel_size: float
+    """Edge of a pixel in the middle of the scene, scene units."""
+    is_unbounded: bool = False
+    """Whether the field is defined in all of space, contracted around the box, with a sky behind."""
+    has_backdrop: bool = False
+    """Whether a bounded scene has something behind it, too."""
+    coarse_to_fine: bool = False
+    """Whether the grid's levels have weights, as refining poses needs them."""
+
+
+class GridField(CoefficientField):
+    """Densities and geometry features of points from a hash grid, and what is behind all of them.
+
+    The heads of a kind of field lie between: random numbers are drawn for grid, heads and sky in this order.
+    """
 
     aabb: Tensor
     level_weights: Tensor | None
     """(L), by which the grid's levels are multiplied; None where all count alike."""
 
-    def __init__(
-        self,
-        config: UnmixFieldConfig,
-        scene_box: SceneBox,
-        num_endmembers: int,
-        num_specular: int,
-        initial_density: float,
-        pixel_size: float,
-        exposure: float = 1.0,
-        lit_by_camera: bool = False,
-        lamp: Lamp | None = None,
-        is_unbounded: bool = False,
-        coarse_to_fine: bool = False,
-        has_sky: bool = False,
-    ) -> None:
+    def __init__(self, config: UnmixFieldConfig, space: FieldSpace, num_endmembers: int) -> None:
         """
         Args:
             config: Sizes.
-            scene_box: Where the field is defined, model space.
             num_endmembers: K.
-            num_specular: J; 0 leaves the view-dependent part out.
-            initial_density: Density of the untrained field, per scene unit.
-            pixel_size: Edge of a pixel in the middle of the scene, scene units.
-            exposure: How dark the scene is: the view-dependent part starts so many times darker.
-            lit_by_camera: Whether the light moves with the camera, so that scales depend on the direction of view.
-            lamp: Where its lamp is at the start of training; None if that is not known.
-            is_unbounded: Whether the field is defined in all of space, contracted around the box, with a sky behind.
-            coarse_to_fine: Whether the grid's levels have weights, as refining poses needs them.
-            has_sky: Whether a bounded scene has something behind it too, such as a backdrop.
         """
         super().__init__()
-        self.config, self.lit_by_camera = config, lit_by_camera
-        self.lamp = MovingLamp(lamp) if lamp is not None and lit_by_camera else None
-        self.lamp_shading: LampShading | None = None
-        self.specular_bias = _SPECULAR_BIAS - math.log(exposure)
-        self.num_endmembers, self.num_specular = num_endmembers, num_specular
+        self.config, self.num_endmembers = config, num_endmembers
+        self.is_unbounded, self._has_backdrop = space.is_unbounded, space.has_backdrop
         self.num_encoded = config.num_levels * config.features_per_level
-        self.log_initial_density = math.log(initial_density)
-        sizes = config.settled(float(scene_box.size.max()), pixel_size, is_unbounded)
+        self.log_initial_density = math.log(space.initial_density)
+        sizes = config.settled(float(space.box.size.max()), space.pixel_size, space.is_unbounded)
         self.layout = HashGridLayout(
             config.num_levels,
             config.features_per_level,
             config.coarsest_resolution,
-            int(sizes.finest_resolution) * (2 if is_unbounded else 1),
+            int(sizes.finest_resolution) * (2 if space.is_unbounded else 1),
             int(sizes.log2_rows_per_level),
         )
-        self.register_buffer("aabb", scene_box.aabb.clone())
-        self.is_unbounded = is_unbounded
+        self.register_buffer("aabb", space.box.aabb.clone())
         table = torch.empty(self.layout.num_rows, config.features_per_level)
         self.table = nn.Parameter(nn.init.uniform_(table, -1e-4, 1e-4))
-        self._make_networks()
-        if is_unbounded or has_sky:
-            num_features = NUM_SKY_FEATURES if is_unbounded else NUM_BACKDROP_FEATURES
-            self.sky_network = bias_free_network(num_features, config.hidden_width, num_endmembers + 1)
-        weights = torch.ones(config.num_levels) if coarse_to_fine else None
-        self.register_buffer("level_weights", weights)
+        self.density_network = bias_free_network(self.num_encoded, config.hidden_width, 1 + NUM_FEATURES)
+        self.register_buffer("level_weights", torch.ones(config.num_levels) if space.coarse_to_fine else None)
 
-    def _make_networks(self) -> None:
-        width, num_features = self.config.hidden_width, NUM_FEATURES + 1
-        num_scales = 1 if self.config.scale == "shared" else self.num_endmembers
-        num_seen = NUM_DIRECTION_FEATURES if self.lamp is None else len(LOBES)
-        self.density_network = bias_free_network(self.num_encoded, width, num_features)
-        self.material_network = bias_free_network(num_features, width, self.num_endmembers + num_scales)
-        if self.num_specular:
-            self.specular_network = bias_free_network(num_features + num_seen, width, self.num_specular + 1)
-        if self.lit_by_camera:
-            self.shading_network = bias_free_network(num_features, width, NUM_DIRECTION_FEATURES)
-        if self.lamp is not None:
-            self.lamp_shading = LampShading(num_features, width, self.lamp.axis)
-
-    @property
-    def moving_lamp(self) -> MovingLamp | None:
-        return self.lamp
+    def _add_sky(self) -> None:
+        """The network of the sky or the backdrop, where there is one; the last that is made."""
+        if self.is_unbounded or self._has_backdrop:
+            num_features = NUM_SKY_FEATURES if self.is_unbounded else NUM_BACKDROP_FEATURES
+            outputs = self.num_endmembers + 1
+            self.sky_network = bias_free_network(num_features, self.config.hidden_width, outputs)
 
     @property
     def has_sky(self) -> bool:
         return hasattr(self, "sky_network")
 
-    def encode(
+    def encoded(
         self, positions: Float[Tensor, "S 3"], known: Float[Tensor, "S LF"] | None = None
     ) -> Float[Tensor, "S LF"]:
+        """The hash grid's encoding of positions; `known` as `hash_encode` takes it."""
         low, high = self.aabb
         if self.is_unbounded:
             unit = contracted_unit((positions - (low + high) / 2) / ((high - low).max() / 2))
         else:
             unit = (positions - low) / (high - low)
         return hash_encode(unit, self.table, self.layout, known)
+
+    def density_and_raw(
+        self, encoded: Float[Tensor, "S LF"]
+    ) -> tuple[Float[Tensor, "S"], Float[Tensor, "S G"]]:
+        """Density per scene unit where the hash grid's encoding is `encoded`; the network's outputs, of which it is the
+        first."""
+        if self.level_weights is not None:
+            encoded = encoded * self.level_weights.repeat_interleave(self.config.features_per_level)
+        raw = in_parts(self.density_network, encoded)
+        return _bounded_exp(raw[:, 0] + self.log_initial_density), raw
 
     def sky(self, rays: RayBundle) -> Float[Tensor, "R C"] | None:
         if not self.has_sky:
@@ -198,11 +190,57 @@ class UnmixField(CoefficientField):
         brightness = _BRIGHTEST * torch.sigmoid(found[:, -1:] - math.log(_BRIGHTEST))
         return torch.cat([shares, brightness], dim=-1)
 
+
+class UnmixField(GridField):
+    """Density, abundances, scales and specular coefficients of points in a scene box."""
+
+    def __init__(
+        self,
+        config: UnmixFieldConfig,
+        space: FieldSpace,
+        num_endmembers: int,
+        num_specular: int,
+        *,
+        exposure: float = 1.0,
+        lit_by_camera: bool = False,
+        lamp: Lamp | None = None,
+    ) -> None:
+        """
+        Args:
+            config, space, num_endmembers: As `GridField` takes them.
+            num_specular: J; 0 leaves the view-dependent part out.
+            exposure: How dark the scene is: the view-dependent part starts so many times darker.
+            lit_by_camera: Whether the light moves with the camera, so that scales depend on the direction of view.
+            lamp: Where its lamp is at the start of training; None if that is not known.
+        """
+        super().__init__(config, space, num_endmembers)
+        self.num_specular, self.lit_by_camera = num_specular, lit_by_camera
+        self.lamp = MovingLamp(lamp) if lamp is not None and lit_by_camera else None
+        self.lamp_shading: LampShading | None = None
+        self.specular_bias = _SPECULAR_BIAS - math.log(exposure)
+        width, num_features = config.hidden_width, 1 + NUM_FEATURES
+        num_scales = 1 if config.scale == "shared" else num_endmembers
+        num_seen = NUM_DIRECTION_FEATURES if self.lamp is None else len(LOBES)
+        self.material_network = bias_free_network(num_features, width, num_endmembers + num_scales)
+        if num_specular:
+            self.specular_network = bias_free_network(num_features + num_seen, width, num_specular + 1)
+        if lit_by_camera:
+            self.shading_network = bias_free_network(num_features, width, NUM_DIRECTION_FEATURES)
+        if self.lamp is not None:
+            self.lamp_shading = LampShading(num_features, width, self.lamp.axis)
+        self._add_sky()
+
+    @property
+    def moving_lamp(self) -> MovingLamp | None:
+        return self.lamp
+
+    def encode(
+        self, positions: Float[Tensor, "S 3"], known: Float[Tensor, "S LF"] | None = None
+    ) -> Float[Tensor, "S LF"]:
+        return self.encoded(positions, known)
+
     def density_of(self, encoded: Float[Tensor, "S LF"]) -> tuple[Float[Tensor, "S"], Float[Tensor, "S G"]]:
-        if self.level_weights is not None:
-            encoded = encoded * self.level_weights.repeat_interleave(self.config.features_per_level)
-        features = in_parts(self.density_network, encoded)
-        return _bounded_exp(features[:, 0] + self.log_initial_density), features
+        return self.density_and_raw(encoded)
 
     def get_outputs(
         self,

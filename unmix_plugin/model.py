@@ -24,7 +24,7 @@ from jaxtyping import Bool
 from torch import Tensor, nn
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.space import RayBundle
+from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
 from unmix_plugin.engine.model import (
     DataManager,
     Model,
@@ -33,7 +33,7 @@ from unmix_plugin.engine.model import (
     TrainOutputs,
 )
 from unmix_plugin.engine.runs.replacing import foreign, move_aside
-from unmix_plugin.field import CoefficientField, UnmixField
+from unmix_plugin.field import FieldSpace, GridField, UnmixField
 from unmix_plugin.light.lamp import Lamp
 from unmix_plugin.light.shading import ShadowDetail
 from unmix_plugin.losses.abundance_guide import AbundanceGuide, first_endmembers, first_specular_spectra
@@ -42,7 +42,7 @@ from unmix_plugin.losses.geometry import normals_error, stray_light
 from unmix_plugin.operators.occupancy import OccupancyGrid
 from unmix_plugin.poses.refinement import PoseRefinement
 from unmix_plugin.poses.training import CorrectedRays, PoseTraining
-from unmix_plugin.presets import choose, preset_for
+from unmix_plugin.presets import AlphaPreset, choose, preset_for
 from unmix_plugin.rendering.grid_upkeep import GRID_INTERVAL, update_grid
 from unmix_plugin.rendering.published_field import PublishedField
 from unmix_plugin.rendering.renderer import RenderedRays, VolumeRenderer
@@ -60,6 +60,103 @@ SAMPLES_ON_CPU, SAMPLES_ON_GPU = 25_000, 400_000
 _FEWEST_RAYS, _FEWEST_SAMPLES_A_RAY = 64, 3
 _FIRST_PART = 0.05
 """Part of the training in which lighter samples may have gradients than later."""
+
+
+@dataclass(frozen=True)
+class SceneTraits:
+    """What the parts of a model are shaped by, from a data manager's metadata."""
+
+    bands: Bands
+    has_alpha: bool
+    is_unbounded: bool
+    has_backdrop: bool
+    pixel_size: float
+    """Edge of a pixel in the middle of the scene, scene units."""
+
+    @staticmethod
+    def of(metadata: Mapping[str, Any]) -> SceneTraits:
+        """Of a scene with this metadata."""
+        centers, widths = (metadata.get(key) for key in ("wavelengths_nm", "fwhm_nm"))
+        return SceneTraits(
+            bands=Bands(np.array(centers, float), None if widths is None else np.array(widths, float)),
+            has_alpha=metadata["has_alpha"],
+            is_unbounded=bool(metadata.get("is_unbounded", False)),
+            has_backdrop=bool(metadata.get("has_backdrop", False)),
+            pixel_size=metadata["pixel_size"],
+        )
+
+    @property
+    def is_carved(self) -> bool:
+        """Whether pictures tell where nothing is."""
+        return self.has_alpha or self.has_backdrop
+
+    @property
+    def preset(self) -> AlphaPreset:
+        """What `auto` means in settings of such a scene."""
+        return preset_for(self.has_alpha, self.is_unbounded, self.has_backdrop)
+
+
+def new_field(
+    config: UnmixModelConfig,
+    scene: SceneTraits,
+    box: SceneBox,
+    num_endmembers: int,
+    num_specular: int,
+    step: float,
+) -> GridField:
+    """The untrained field of K endmembers and J specular coefficients; samples lie `step` apart at first."""
+    opacity = float(config.initial_opacity)
+    sizes, refines = config.field, config.poses == "refine"
+    if refines:
+        sizes = replace(sizes, coarsest_resolution=min(sizes.coarsest_resolution, COARSEST_REFINED))
+    space = FieldSpace(
+        box,
+        initial_density=-math.log1p(-opacity) / step,
+        pixel_size=scene.pixel_size,
+        is_unbounded=scene.is_unbounded,
+        has_backdrop=scene.has_backdrop,
+        coarse_to_fine=refines,
+    )
+    if config.as_published:
+        return PublishedField(sizes, space, num_endmembers, num_specular)
+    return UnmixField(
+        sizes,
+        space,
+        num_endmembers,
+        num_specular,
+        exposure=float(config.losses.exposure),
+        lit_by_camera=config.light == "camera",
+        lamp=lamp_of(config),
+    )
+
+
+def lamp_of(config: UnmixModelConfig) -> Lamp | None:
+    """Where the lamp that moves with the camera is before training; None if there is none or that is not known."""
+    return Lamp.of_numbers([float(number) for number in config.lamp]) if config.lamp else None
+
+
+def new_grid(
+    config: UnmixModelConfig, scene: SceneTraits, reachable: Bool[torch.Tensor, "X Y Z"]
+) -> OccupancyGrid:
+    """The grid before training. Where little was carved, cells are too many to wait until each was probed: what rays
+    meet in them counts as well."""
+    records_observed = not scene.is_carved or config.poses == "refine"
+    return OccupancyGrid(reachable, lamp_of(config) is not None, records_observed)
+
+
+def new_view_gains(config: UnmixModelConfig, metadata: Mapping[str, Any]) -> ViewGains | None:
+    """Gains of the training views; None where their exposure is one."""
+    if config.light != "per-view":
+        return None
+    return ViewGains(metadata["num_train_views"], torch.tensor(metadata["wavelengths_nm"]))
+
+
+def new_poses(config: UnmixModelConfig, metadata: Mapping[str, Any]) -> PoseRefinement | None:
+    """Corrections of the training views' poses; None where they are taken as they are."""
+    if config.poses != "refine":
+        return None
+    rows = metadata.get("line_rows") or [0] * metadata["num_train_views"]
+    return PoseRefinement(rows, config.pose_refinement.lens)
 
 
 @dataclass(frozen=True)
@@ -93,51 +190,45 @@ class UnmixModel(Model):
     def populate_modules(self) -> None:
         """Field, grid, endmembers (K, B) and specular spectra (J, B), shaped by config and metadata. Raises
         ConfigError: more endmembers than bands."""
-        self.longest_edge, metadata = float(self.scene_box.size.max()), self.metadata
+        metadata, box = self.metadata, self.scene_box
+        self.longest_edge = float(box.size.max())
         config = self.config = self.config.settled(self.longest_edge, metadata)
-        centers, widths = (metadata.get(key) for key in ("wavelengths_nm", "fwhm_nm"))
-        self.bands = Bands(np.array(centers, float), None if widths is None else np.array(widths, float))
-        self.is_unbounded = bool(metadata.get("is_unbounded", False))
-        self.has_backdrop = bool(metadata.get("has_backdrop", False))
-        self.is_carved = metadata["has_alpha"] or self.has_backdrop
-        """Whether pictures tell where nothing is."""
-        self.preset = preset_for(metadata["has_alpha"], self.is_unbounded, self.has_backdrop)
+        scene = SceneTraits.of(metadata)
+        self.bands, self.preset, self.is_carved = scene.bands, scene.preset, scene.is_carved
+        self.is_unbounded, self.has_backdrop = scene.is_unbounded, scene.has_backdrop
         assert isinstance(config.num_endmembers, int)
-        self.num_endmembers = config.num_endmembers
-        shape = (self.num_endmembers, len(self.bands))
-        self.endmembers = nn.Parameter(torch.zeros(shape), requires_grad=config.train_endmembers)
-        num_dictionary = config.num_dictionary_spectra(self.preset, self.num_endmembers)
-        self.specular_spectra = nn.Parameter(torch.zeros(num_dictionary, len(self.bands)))
-        self._lamp = Lamp.of_numbers([float(x) for x in config.lamp]) if config.lamp else None
-        self.grid = self._new_grid(torch.ones((metadata["grid_resolution"],) * 3, dtype=torch.bool))
-        self._renderer: VolumeRenderer | None = None
-        self.step = metadata["pixel_size"] / float(config.renderer.samples_per_pixel)
-        self.field = self._new_field()
-        self.register_buffer("rgb_weights", rgb_matrix(self.bands), persistent=False)
-        self.register_buffer("every_band", torch.eye(len(self.bands)), persistent=False)
+        num_bands, self.num_endmembers = len(scene.bands), config.num_endmembers
+        num_dictionary = config.num_dictionary_spectra(scene.preset, self.num_endmembers)
+        spectra = torch.zeros(self.num_endmembers, num_bands)
+        self.endmembers = nn.Parameter(spectra, requires_grad=config.train_endmembers)
+        self.specular_spectra = nn.Parameter(torch.zeros(num_dictionary, num_bands))
+        self.step = scene.pixel_size / float(config.renderer.samples_per_pixel)
+        self.grid = new_grid(config, scene, torch.ones((metadata["grid_resolution"],) * 3, dtype=torch.bool))
+        num_specular = num_bands if config.specular == "full" else num_dictionary
+        self.field = new_field(
+            config, scene, box, self.num_endmembers, num_specular, self.step * self._coarseness(0.0)
+        )
+        self.register_buffer("rgb_weights", rgb_matrix(scene.bands), persistent=False)
+        self.register_buffer("every_band", torch.eye(num_bands), persistent=False)
         self.register_buffer("endmember_bound", torch.ones(()))
-        self.guide = AbundanceGuide(*shape)
-        self.view_gains: ViewGains | None = None
-        if config.light == "per-view":
-            self.view_gains = ViewGains(metadata["num_train_views"], torch.tensor(metadata["wavelengths_nm"]))
-        self.poses: PoseRefinement | None = None
-        if config.poses == "refine":
-            rows = metadata.get("line_rows") or [0] * metadata["num_train_views"]
-            self.poses = PoseRefinement(rows, config.pose_refinement.lens)
+        self.guide = AbundanceGuide(self.num_endmembers, num_bands)
+        self.view_gains = new_view_gains(config, metadata)
+        self.poses = new_poses(config, metadata)
         self.seen_by = SensorViews(metadata.get("sensors", ()), self.rgb_weights)
         weights = tuple(float(weight) for weight in config.losses.band_weights)
-        self.balance = BandBalance(weights, self.bands, self.seen_by)
+        self.balance = BandBalance(weights, scene.bands, self.seen_by)
         self.comparison = BatchComparison(
             config.losses,
-            self.preset,
-            self.seen_by,
-            self.balance,
-            self.guide,
-            self.view_gains,
-            config.as_published,
-            self.field.has_sky,
+            scene.preset,
+            seen_by=self.seen_by,
+            balance=self.balance,
+            guide=self.guide,
+            view_gains=self.view_gains,
+            as_published=config.as_published,
+            has_sky=self.field.has_sky,
         )
         self._pose_training = PoseTraining(config.pose_refinement, self.poses)
+        self._renderer: VolumeRenderer | None = None
         self._progress = 0.0
         self._occupied_share = torch.ones(())
 
@@ -171,7 +262,7 @@ class UnmixModel(Model):
         self.guide.start(pixels, endmembers, seen)
         self.specular_spectra.copy_(first_specular_spectra(len(self.specular_spectra), lamp, endmembers))
         reachable = self._pose_training.begin(initial_data, self.scene_box, self.metadata["pixel_size"])
-        self.grid = self._new_grid(reachable).to(self.device)
+        self.grid = new_grid(self.config, SceneTraits.of(self.metadata), reachable).to(self.device)
 
     @torch.no_grad()
     def between_steps(self, step: int, progress: float, data: DataManager) -> Collection[str]:
@@ -248,7 +339,7 @@ class UnmixModel(Model):
         if self.is_unbounded:
             metrics["matter_share"] = rendered.coefficients.accumulation.detach().mean()
         with torch.no_grad():
-            self.learn_from(step)
+            self.update(step)
         return {"num_samples": torch.tensor(rendered.num_samples)}, losses, metrics
 
     def training_batch(self, ray_bundle: RayBundle, measured: list[MeasuredPixels]) -> TrainingBatch:
@@ -278,7 +369,7 @@ class UnmixModel(Model):
         weighed = {name: weights[name] * losses[name] for name in weights if name in losses}
         return weighed | self._pose_training.penalty(step.corrected)
 
-    def learn_from(self, step: TrainingBatch) -> None:
+    def update(self, step: TrainingBatch) -> None:
         """Note which cells the views see, and how far margins of abundances are from those of measured spectra."""
         rendered, views = step.rendered, step.corrected.rays.camera_indices
         visible_weight = float(self.config.renderer.visible_weight)
@@ -289,8 +380,8 @@ class UnmixModel(Model):
         if self.grid.observed is not None:
             positions, densities = map(rendered.visible.all_of, ("positions", "densities"))
             self.grid.record_observed(self.renderer.space.to_unit(positions.detach()), densities)
-        self.comparison.observe(step.compared)
-        self._pose_training.observe(step.compared, step.corrected)
+        self.comparison.update(step.compared)
+        self._pose_training.update(step.compared, step.corrected)
 
     def _rendered(self, rays: RayBundle) -> RenderedRays:
         renderer = self._training_renderer if self.training else self.renderer
@@ -379,33 +470,6 @@ class UnmixModel(Model):
     def _coarseness(self, progress: float) -> float:
         """How many times farther apart samples are in training than in the end: large images begin coarsely."""
         return self.config.renderer.coarseness(self.longest_edge / self.step, progress)
-
-    def _new_field(self) -> CoefficientField:
-        config, opacity = self.config, float(self.config.initial_opacity)
-        field, refines = config.field, config.poses == "refine"
-        if refines:
-            field = replace(field, coarsest_resolution=min(field.coarsest_resolution, COARSEST_REFINED))
-        make = PublishedField if config.as_published else UnmixField
-        return make(
-            field,
-            self.scene_box,
-            self.num_endmembers,
-            len(self.bands) if config.specular == "full" else len(self.specular_spectra),
-            -math.log1p(-opacity) / (self.step * self._coarseness(0.0)),
-            self.metadata["pixel_size"],
-            float(config.losses.exposure),
-            config.light == "camera",
-            self._lamp,
-            self.is_unbounded,
-            refines,
-            self.has_backdrop,
-        )
-
-    def _new_grid(self, reachable: Bool[Tensor, "X Y Z"]) -> OccupancyGrid:
-        """Before training. Where little was carved, cells are too many to wait until each was probed: what rays meet
-        in them counts as well."""
-        records_observed = not self.is_carved or self.config.poses == "refine"
-        return OccupancyGrid(reachable, self._lamp is not None, records_observed)
 
     def _begin_step(self, step: int, progress: float) -> None:
         self._progress = progress

@@ -150,7 +150,7 @@ def test_poses_of_line_cameras_are_corrected_on_a_gpu(monkeypatch):
         moved = poses(rays, there, steps, 1 / poses.robust.weights[poses.nearest_knots(rays)])
         (moved.directions.sum() + poses.penalty(steps)).backward()
         assert poses.steps.grad is not None
-        poses.undo_runaways()
+        poses.restore_best()
         found = poses.refined(given)
         assert_close(found.camera_to_world, given.camera_to_world, atol=1e-5, rtol=0)
 

@@ -85,7 +85,7 @@ def observed(deviation, steps=60):
         mixed = share * pure + (1 - share) * pure.roll(1, dims=1)
         off = deviation / 2 * torch.randn(200, 1, generator=generator)
         pixels = measured(mixed @ ENDMEMBERS, first=200 * step)
-        found.observe(mixed + off * (pure - pure.roll(1, dims=1)), pixels, ENDMEMBERS)
+        found.update(mixed + off * (pure - pure.roll(1, dims=1)), pixels, ENDMEMBERS)
     return found
 
 
@@ -100,8 +100,8 @@ def test_what_does_not_count_or_is_not_finite_leaves_the_error_of_margins_as_it_
     known = observed(0.05, steps=3)
     before = known.margin_error.clone()
     even = torch.full((4, 4), 0.25)
-    known.observe(even, measured(torch.zeros(4, ENDMEMBERS.shape[1]), first=600), ENDMEMBERS)
-    known.observe(torch.nan * even, measured(even @ ENDMEMBERS, first=604), ENDMEMBERS)
+    known.update(even, measured(torch.zeros(4, ENDMEMBERS.shape[1]), first=600), ENDMEMBERS)
+    known.update(torch.nan * even, measured(even @ ENDMEMBERS, first=604), ENDMEMBERS)
     assert torch.equal(known.margin_error, before)
 
 

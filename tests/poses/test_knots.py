@@ -81,5 +81,5 @@ def test_a_sweep_that_goes_far_in_a_few_rows_is_not_undone_and_one_that_goes_far
     with torch.no_grad():
         found.steps[:11, 0] = torch.linalg.solve(row_waves(11), few)
         found.steps[11, 0] = 0.3 / float(row_waves(11)[0, 0])
-    found.undo_runaways()
+    found.restore_best()
     assert found.is_free.tolist() == [True, False, True]

@@ -113,7 +113,7 @@ def test_a_view_that_runs_away_gets_its_pose_back_and_keeps_it(runaways, is_fina
     with torch.no_grad():
         found.steps.fill_(0.01)
         found.steps[4 - runaways :, 0] = 2 * LARGEST_STEP
-    found.undo_runaways(is_final=is_final)
+    found.restore_best(is_final=is_final)
     assert found.is_free.tolist() == free
     assert torch.equal(corrections(found)[3], torch.zeros(6))
     assert bool((corrections(found)[0] != 0).all()) == (runaways == 1)
@@ -135,7 +135,7 @@ def test_steps_are_a_share_of_a_pixel_and_bounds_a_share_of_the_picture():
         found.steps[3] = 0.3  # 0.075 radians about each axis, where the scene spans 0.0625
     turns = corrections(found)[:3, :3].norm(dim=1)
     assert_close(turns / turns[0], torch.tensor([1.0, 1.0, 0.25]))
-    found.undo_runaways()
+    found.restore_best()
     assert found.is_free.tolist() == [True, True, True, False]
 
 
@@ -249,8 +249,8 @@ def observed(errors: torch.Tensor, matter: torch.Tensor | None = None) -> _Robus
     robust = _RobustWeights(len(errors))
     shown = torch.ones(len(errors), dtype=torch.bool) if matter is None else matter
     for _ in range(20):
-        robust.observe(torch.arange(len(errors)), errors, shown)
-    robust.update(Processes())
+        robust.update(torch.arange(len(errors)), errors, shown)
+    robust.judge(Processes())
     return robust
 
 
@@ -275,13 +275,13 @@ def test_a_pose_that_fits_again_is_an_inlier_again():
     robust = observed(errors)
     assert robust.weights[3] < 0.01
     for _ in range(600):
-        robust.observe(torch.arange(KNOTS), torch.full((KNOTS,), 1e-3), torch.ones(KNOTS, dtype=torch.bool))
-    robust.update(Processes())
+        robust.update(torch.arange(KNOTS), torch.full((KNOTS,), 1e-3), torch.ones(KNOTS, dtype=torch.bool))
+    robust.judge(Processes())
     assert_close(robust.weights, torch.ones(KNOTS))
     broken = observed(torch.cat([torch.ones(KNOTS - 1), torch.tensor([torch.nan])]))
     assert_close(broken.weights, torch.ones(KNOTS))
     unseen = _RobustWeights(KNOTS)
-    unseen.update(Processes())
+    unseen.judge(Processes())
     assert_close(unseen.weights, torch.ones(KNOTS))
 
 

@@ -8,6 +8,7 @@ from torch.testing import assert_close
 from tests.method_factory import BOX, NUM_BANDS, make_model, make_rays, scene_of
 from unmix_plugin.engine.runs.config_json import config_from_json, config_to_json
 from unmix_plugin.errors import ConfigError
+from unmix_plugin.field import FieldSpace
 from unmix_plugin.method_config import unmix_nerf_published
 from unmix_plugin.rendering.published_field import PublishedField
 from unmix_plugin.settings import UnmixFieldConfig, UnmixModelConfig
@@ -24,7 +25,7 @@ SMALL = UnmixFieldConfig(temperature=0.4, scale="per-endmember", **SIZES)
 @pytest.fixture
 def field() -> PublishedField:
     torch.manual_seed(0)
-    made = PublishedField(SMALL, BOX, 3, NUM_BANDS, initial_density=2.0, pixel_size=0.1)
+    made = PublishedField(SMALL, FieldSpace(BOX, 2.0, 0.1), 3, NUM_BANDS)
     with torch.no_grad():
         made.table.normal_(std=0.5)
     return made

@@ -9,7 +9,7 @@ from torch.testing import assert_close
 from tests.method_factory import BOX
 from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.field import UnmixField
+from unmix_plugin.field import FieldSpace, UnmixField
 from unmix_plugin.operators.compositing import volume_weights
 from unmix_plugin.operators.marching import PackedSamples
 from unmix_plugin.operators.occupancy import skip_distances
@@ -26,7 +26,7 @@ def make(
 ) -> tuple[VolumeRenderer, UnmixField]:
     """With `depth` every sample has that optical depth."""
     torch.manual_seed(0)
-    field = UnmixField(UnmixFieldConfig(log2_rows_per_level=8), BOX, 3, 1, 1.0, PIXEL)
+    field = UnmixField(UnmixFieldConfig(log2_rows_per_level=8), FieldSpace(BOX, 1.0, PIXEL), 3, 1)
     cells, step = torch.ones(8, 8, 8) > 0, pixel / 1.5
     if depth is not None:
         nn.init.zeros_(field.table)

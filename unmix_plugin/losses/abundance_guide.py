@@ -86,7 +86,7 @@ class AbundanceGuide(nn.Module):
         distances = (abundances - mixtures).square().sum(dim=1)
         return torch.where(_is_informative(measured), distances, 0.0).mean()
 
-    def observe(
+    def update(
         self, abundances: Float[Tensor, "R K"], measured: MeasuredPixels, endmembers: Float[Tensor, "K b"]
     ) -> None:
         """Follow how far margins of composited abundances are from those of the measured spectra."""

@@ -24,8 +24,8 @@ from unmix_plugin.sensors.views import BandBalance, SensorViews, ViewGains
 from unmix_plugin.settings import LossConfig
 from unmix_plugin.spectral.evidence import (
     bounded_square,
-    forgive_saturation,
     is_blown_out,
+    mask_saturated,
     over_background,
     relative_weights,
     solid_evidence,
@@ -33,8 +33,8 @@ from unmix_plugin.spectral.evidence import (
 )
 from unmix_plugin.spectral.materials import Coefficients, Materials
 
-_MATTER = 0.01
-"""Opacity of pixels that show matter."""
+_FOREGROUND = 0.01
+"""Opacity of pixels that show foreground."""
 _OUTLIER = 1.0
 """Error of an exposed value above which it counts in proportion instead of squared. It matters in dark scenes only: a
 blown-out pixel would otherwise outweigh all others. What a saturated value misses is unknown anyway, so for such pixels
@@ -99,6 +99,26 @@ class ComparedPixels:
 
 
 @dataclass(frozen=True)
+class SpectralTerm:
+    """What rendered spectra cost: the mean of their squared errors, bounded and weighted."""
+
+    prediction: Float[Tensor, "R b"]
+    """Exposed, over a background."""
+    target: Float[Tensor, "R b"]
+    outlier: Float[Tensor, "R 1"]
+    """Error from which on it counts in proportion instead of squared."""
+    weight: tuple[Float[Tensor, "*"], ...]
+    """Factors of the squares, by channel and by pixel."""
+
+    def loss(self) -> Float[Tensor, ""]:
+        """The mean."""
+        squares = bounded_square(self.prediction - self.target, self.outlier)
+        for factor in self.weight:
+            squares = factor * squares
+        return squares.mean()
+
+
+@dataclass(frozen=True)
 class BatchComparison:
     """What each sensor of a batch should have seen, and what it saw."""
 
@@ -110,7 +130,7 @@ class BatchComparison:
     view_gains: ViewGains | None
     as_published: bool = False
     has_sky: bool = False
-    """Whether something is behind all matter: no background shines through."""
+    """Whether something is behind all that is rendered: no background shines through."""
 
     def compare(
         self,
@@ -167,47 +187,52 @@ class BatchComparison:
         compared: Sequence[ComparedPixels], knots: Int[Tensor, "N"]
     ) -> tuple[Int[Tensor, "R"], Float[Tensor, "R"], Bool[Tensor, "R"]]:
         """Of each pixel the nearest knot of its pose (given of each ray), its mean squared error on black, and whether
-        it shows matter in the picture or in the scene."""
+        it shows foreground in the picture or in the scene."""
         own = torch.cat([knots[part.rays] for part in compared])
         squares = [(x.spectra.detach() - x.measured.spectra).square().mean(dim=1) for x in compared]
-        matter = [torch.maximum(x.measured.alpha, x.opacities.detach()) > _MATTER for x in compared]
-        return own, torch.cat(squares), torch.cat(matter)
+        foreground = [torch.maximum(x.measured.alpha, x.opacities.detach()) > _FOREGROUND for x in compared]
+        return own, torch.cat(squares), torch.cat(foreground)
 
-    def observe(self, compared: Sequence[ComparedPixels]) -> None:
+    def update(self, compared: Sequence[ComparedPixels]) -> None:
         """Note how far margins of abundances are from those of measured spectra."""
         if self.config.abundances == 0:
             return
         for part in compared:
             if self._tells_materials(part):
-                self.guide.observe(part.abundances, *self._guided(part))
+                self.guide.update(part.abundances, *self._guided(part))
 
     def _losses_of(
         self, part: ComparedPixels, wanted: set[str], generator: torch.Generator | None
     ) -> dict[str, Tensor]:
         measured, exposure = part.measured, choose(self.config.exposure, 1.0)
-        grey = self._background(measured, generator)
-        target = over_background(exposure * measured.spectra, measured.alpha, grey)
-        covered = torch.ones_like(part.opacities) if self.has_sky else part.opacities
-        predicted = over_background(exposure * part.spectra, covered, grey)
-        predicted = forgive_saturation(predicted, target, measured.spectra)
-        bound = _NO_OUTLIER if self.as_published else _OUTLIER
-        outliers = torch.where(is_blown_out(measured.spectra), bound / exposure, bound)[:, None]
-        squares = bounded_square(predicted - target, outliers)
-        weights, power = self.balance.of(measured.sensor), choose(self.config.relative, 0.0)
-        if weights is not None:
-            squares = weights * squares
-        if power > 0:
-            squares = relative_weights(predicted, power)[:, None] * squares
-        losses = {"spectral": squares.mean()}
+        spectra = self._spectral_term(part, exposure, generator)
+        losses = {"spectral": spectra.loss()}
         if "rgb" in wanted:
             colours = self.seen_by.rgb_weights(measured.sensor)
-            losses["rgb"] = srgb_error(predicted, target, colours, outliers)
+            losses["rgb"] = srgb_error(spectra.prediction, spectra.target, colours, spectra.outlier)
         if "opacity" in wanted:
             evidence = solid_evidence(exposure * measured.spectra)
             losses["opacity"] = (evidence * (1 - part.opacities).square()).mean()
         if "abundances" in wanted and self._tells_materials(part):
             losses["abundances"] = self.guide.error(part.abundances, *self._guided(part))
         return losses
+
+    def _spectral_term(
+        self, part: ComparedPixels, exposure: float, generator: torch.Generator | None
+    ) -> SpectralTerm:
+        """Rendered and measured spectra over the same background; errors of saturated values are masked."""
+        measured, grey = part.measured, self._background(part.measured, generator)
+        opacity = torch.ones_like(part.opacities) if self.has_sky else part.opacities
+        target = over_background(exposure * measured.spectra, measured.alpha, grey)
+        prediction = over_background(exposure * part.spectra, opacity, grey)
+        prediction = mask_saturated(prediction, target, measured.spectra)
+        bound = _NO_OUTLIER if self.as_published else _OUTLIER
+        outlier = torch.where(is_blown_out(measured.spectra), bound / exposure, bound)[:, None]
+        by_channel, power = self.balance.of(measured.sensor), choose(self.config.relative, 0.0)
+        weight = () if by_channel is None else (by_channel,)
+        if power > 0:
+            weight = (*weight, relative_weights(prediction, power)[:, None])
+        return SpectralTerm(prediction, target, outlier, weight)
 
     def _background(
         self, measured: MeasuredPixels, generator: torch.Generator | None

@@ -81,7 +81,7 @@ class _RobustWeights(nn.Module):
         self.register_buffer("weights", torch.ones(num_knots))
 
     @torch.no_grad()
-    def observe(
+    def update(
         self, knots: Int[Tensor, " R"], squares: Float[Tensor, " R"], shows_matter: Bool[Tensor, " R"]
     ) -> None:
         """Note the mean squared errors of pixels, each near one of the knots; infinite ones and NaN are left out."""
@@ -91,7 +91,7 @@ class _RobustWeights(nn.Module):
         self.counts.mul_(_MEMORY).index_add_(0, knots, shown)
 
     @torch.no_grad()
-    def update(self, processes: Processes) -> None:
+    def judge(self, processes: Processes) -> None:
         """Decide what pixels weigh, alike in all processes."""
         processes.reduce(self.squares, "mean")
         processes.reduce(self.counts, "mean")
@@ -258,7 +258,7 @@ class PoseRefinement(nn.Module):
         return moved.to(cameras.camera_to_world.device)
 
     @torch.no_grad()
-    def undo_runaways(self, is_final: bool = True) -> None:
+    def restore_best(self, is_final: bool = True) -> None:
         """Give views that went too far their poses back, where most did, all; they keep them if it is final."""
         sizes = self._sizes(self.free_steps()).amax(dim=1) / self.bound
         views = torch.arange(len(self.is_free), device=sizes.device).repeat_interleave(self.counts)

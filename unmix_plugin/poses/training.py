@@ -21,7 +21,7 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
 from unmix_plugin.engine.model import DataManager
 from unmix_plugin.engine.processes import Processes
-from unmix_plugin.field import CoefficientField, UnmixField
+from unmix_plugin.field import CoefficientField, GridField
 from unmix_plugin.losses.comparison import BatchComparison, ComparedPixels
 from unmix_plugin.poses.refinement import PoseRefinement
 from unmix_plugin.settings import PoseConfig
@@ -73,14 +73,14 @@ class PoseTraining:
     def begin_step(self, step: int, progress: float, field: CoefficientField) -> None:
         """Let as many levels of the field's grid join as it is time for."""
         self._fineness = self._config.fineness(step, progress)
-        if isinstance(field, UnmixField) and field.level_weights is not None:
+        if isinstance(field, GridField) and field.level_weights is not None:
             levels = self._config.level_weights(len(field.level_weights), self._fineness)
             field.level_weights.copy_(torch.tensor(levels))
 
     def end_step(self) -> None:
         """Give views that lost their way their poses back."""
         if self._poses is not None:
-            self._poses.undo_runaways(is_final=self._is_fine)
+            self._poses.restore_best(is_final=self._is_fine)
 
     def between_steps(self, data: DataManager) -> Bool[Tensor, "X Y Z"] | None:
         """Know the cameras; and once, when the levels of the grid have joined, what these can't carve away."""
@@ -107,15 +107,15 @@ class PoseTraining:
         moved = self._poses(rays, self._cameras, steps, 1 / weights)
         return CorrectedRays(moved, steps, knots, weights) if self._is_fine else CorrectedRays(moved, steps)
 
-    def observe(self, compared: Sequence[ComparedPixels], corrected: CorrectedRays) -> None:
+    def update(self, compared: Sequence[ComparedPixels], corrected: CorrectedRays) -> None:
         """Note how well pixels fit, as far as it tells of their poses."""
         if self._poses is not None and corrected.knots is not None:
-            self._poses.robust.observe(*BatchComparison.pose_errors(compared, corrected.knots))
+            self._poses.robust.update(*BatchComparison.pose_errors(compared, corrected.knots))
 
     def update_weights(self, processes: Processes) -> None:
         """Decide which poses are outliers."""
         if self._poses is not None and self._is_fine:
-            self._poses.robust.update(processes)
+            self._poses.robust.judge(processes)
 
     def penalty(self, corrected: CorrectedRays) -> dict[str, Float[Tensor, ""]]:
         """What large and rough corrections cost, as `poses`; nothing where none are made."""

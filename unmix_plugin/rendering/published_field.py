@@ -15,41 +15,51 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from unmix_plugin.field import NUM_FEATURES, UnmixField
+from unmix_plugin.field import NUM_FEATURES, FieldSpace, GridField
 from unmix_plugin.light.shading import (
     NUM_DIRECTION_FEATURES,
     Lamplight,
     bias_free_network,
     direction_features,
 )
+from unmix_plugin.settings import UnmixFieldConfig
 
 _NUM_FREQUENCIES = 2
 _NUM_POSITION_FEATURES = 3 * 2 * _NUM_FREQUENCIES
 
 
-class PublishedField(UnmixField):
+class PublishedField(GridField):
     """Density, abundances, scales and one view-dependent value a band (J = B), of points in a scene box."""
 
-    def _make_networks(self) -> None:
-        width, num_features = self.config.hidden_width, NUM_FEATURES + _NUM_POSITION_FEATURES
-        self.density_network = bias_free_network(self.num_encoded, width, 1 + NUM_FEATURES)
-        self.material_network = bias_free_network(num_features, width, width, self.num_endmembers + 1)
-        self.scale_network = bias_free_network(num_features, width, width, self.num_endmembers)
-        if self.num_specular:
+    def __init__(
+        self, config: UnmixFieldConfig, space: FieldSpace, num_endmembers: int, num_specular: int
+    ) -> None:
+        """
+        Args:
+            config, space, num_endmembers: As `GridField` takes them.
+            num_specular: J; 0 leaves the view-dependent part out.
+        """
+        super().__init__(config, space, num_endmembers)
+        self.num_specular = num_specular
+        width, num_features = config.hidden_width, NUM_FEATURES + _NUM_POSITION_FEATURES
+        self.material_network = bias_free_network(num_features, width, width, num_endmembers + 1)
+        self.scale_network = bias_free_network(num_features, width, width, num_endmembers)
+        if num_specular:
             seen = NUM_DIRECTION_FEATURES + 1 + _NUM_POSITION_FEATURES
-            self.specular_network = bias_free_network(seen, 16, self.num_specular)
+            self.specular_network = bias_free_network(seen, 16, num_specular)
+        self._add_sky()
 
     def encode(
         self, positions: Float[Tensor, "S 3"], known: Float[Tensor, "S L"] | None = None
     ) -> Float[Tensor, "S L"]:
         """The hash grid's encoding of positions, then PE; `known` as `hash_encode` takes it."""
         first = None if known is None else known[:, : self.num_encoded].contiguous()
-        return torch.cat([super().encode(positions, first), _position_features(positions)], -1)
+        return torch.cat([self.encoded(positions, first), _position_features(positions)], -1)
 
     def density_of(self, encoded: Float[Tensor, "S L"]) -> tuple[Float[Tensor, "S"], Float[Tensor, "S G"]]:
         """Density per scene unit; g and PE."""
-        density, features = super().density_of(encoded[:, : self.num_encoded])
-        return density, torch.cat([features[:, 1:], encoded[:, self.num_encoded :]], dim=-1)
+        density, raw = self.density_and_raw(encoded[:, : self.num_encoded])
+        return density, torch.cat([raw[:, 1:], encoded[:, self.num_encoded :]], dim=-1)
 
     def get_outputs(
         self,

@@ -123,7 +123,7 @@ def over_background(
     return spectra + (1 - opacities)[..., None] * background
 
 
-def forgive_saturation(
+def mask_saturated(
     pred_spectra: Float[Tensor, "R B"], target_spectra: Float[Tensor, "R B"], measured: Float[Tensor, "R B"]
 ) -> Float[Tensor, "R B"]:
     """The prediction, but the target where it is brighter than a saturated sensor could measure."""
