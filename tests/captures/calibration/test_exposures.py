@@ -18,7 +18,7 @@ from tests.captures.capture_factory import (
 )
 from tests.captures.file_factory import file_of, present
 from unmix_plugin.captures.calibration.exposures import ExposedFiles, compare_exposures, exposure_of
-from unmix_plugin.captures.header_values import exposure_facts
+from unmix_plugin.captures.fields import exposure_facts
 from unmix_plugin.captures.report import Code, Kind, Remark, sentences
 from unmix_plugin.captures.spectral_file import Linear
 

@@ -15,9 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from unmix_plugin.captures.header_values import (
+from unmix_plugin.captures.fields import (
     GOOD,
     NAMES,
+    OF_ALL_IMAGES,
+    Format,
     check_bands,
     counts_bands,
     exposure_facts,
@@ -46,13 +48,6 @@ _NO_DATA = (
     *("nodata", "no_data", "nodata_value", "no_data_value"),
 )
 _VALID = ("valid_range", "valid_min", "valid_max")
-_GAINS = ("scale_factor", "scalefactor", "scale", "gain", "gains", "slope")
-_OFFSETS = ("add_offset", "offset", "offsets", "bias", "intercept")
-_OF_ALL = ("scale_factor", "reflectance_scale_factor", "add_offset")
-"""Names that hold for all images of a file; the others mean this only beside the numbers themselves."""
-_MAY_DIVIDE = ("scale_factor", "scalefactor", "scale")
-"""Plain names of factors that divide where they are above 1, as NEON's `Scale_Factor` does; CF's `scale_factor`
-never does."""
 _QUALITY = re.compile(r"(^|_)(err|error|errors|flags?|mask|quality|qa|uncertainty|std|stddev)(_|$)")
 """What an array of three axes is called that measures nothing itself."""
 _WINDOW = re.compile(r"band_window_\d+_nanometers", re.I)
@@ -372,25 +367,16 @@ def _unpacked(array: FoundArray) -> list[Any]:
 
 
 def _linear(path: Path, image: FoundArray, num_bands: int, warnings: list[str]) -> Linear | None:
-    """Gains and offsets among the attributes: value = factor * stored + offset, as climate files have it.
-
-    Source: CF conventions, 8.1. A single factor above 1 without an offset divides under a name that is not CF's, as
-    NEON's 10000 does. PRISMA's are those of its level.
-    """
+    """Gains and offsets among the attributes of an image, or those of its level of PRISMA."""
     found = {key: _numbers(value) for key, value in image.all_attributes.items()}
     plain = plain_names({key: numbers for key, numbers in found.items() if numbers})
-    found = {key: found[key] for name, key in plain.items() if key in image.attributes or name in _OF_ALL}
+    found = {
+        key: found[key] for name, key in plain.items() if key in image.attributes or name in OF_ALL_IMAGES
+    }
     named = plain_names(found)
-    # An offset, 0 too, is CF's, whose factors multiply whatever they are.
-    name = next((name for name in _GAINS if name in named), "")
-    key = named.get(name, "")
-    if name in _MAY_DIVIDE and key != "scale_factor" and not any(name in named for name in _OFFSETS):
-        found[key] = (
-            [1 / gain if gain > 1 else gain for gain in found[key]] if len(found[key]) == 1 else found[key]
-        )
-    if name == "scale_factor":
+    if "scale_factor" in named:  # before the factor of reflectances
         found.pop(named.get("reflectance_scale_factor", ""), None)
-    linear = state_linear(path, num_bands, found, "attribute", [(_GAINS, _OFFSETS)], warnings)
+    linear = state_linear(path, num_bands, found, "attribute", Format.ARRAYS, warnings)
     return linear or _prisma(path, image, num_bands)
 
 
@@ -418,8 +404,12 @@ def _unread(path: Path, image: FoundArray) -> list[str]:
     for name, key in plain_names(attributes).items():
         value = attributes[key]
         is_read = value is not UNREADABLE
-        is_own = key in image.attributes and name in (*_GAINS, *_OFFSETS) and name != "gain"
-        if name in _OF_ALL and not _numbers(value):
+        is_own = (
+            key in image.attributes
+            and name in (*Format.ARRAYS.gains, *Format.ARRAYS.offsets)
+            and name != "gain"
+        )
+        if name in OF_ALL_IMAGES and not _numbers(value):
             found = f"is {str(value)[:40]!r}, no number" if is_read else "is of a type that can't be read"
             raise CaptureError(
                 f"{path}: attribute '{key}' {found}: without it all numbers would be false; write it as a number, or "

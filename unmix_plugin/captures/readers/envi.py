@@ -6,7 +6,14 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
-from unmix_plugin.captures.header_values import check_bands, exposure_facts, listed, state_bands, state_linear
+from unmix_plugin.captures.fields import (
+    Format,
+    check_bands,
+    exposure_facts,
+    listed,
+    state_bands,
+    state_linear,
+)
 from unmix_plugin.captures.numbers import Mapped, Numbers
 from unmix_plugin.captures.spectral_file import ReadOptions, SpectralFile
 from unmix_plugin.errors import CaptureError, counted
@@ -38,11 +45,6 @@ _DARK_LINES = (
 
 _OF_RESONON = {"shutter", "gain", "framerate"}
 _OF_BANDS = ("wavelength", "wavelength units", "fwhm", "bbl", "band names")
-_GAINS_AND_OFFSETS = [
-    (("data_reflectance_gain_values",), ("data_reflectance_offset_values",)),
-    (("data_gain_values",), ("data_offset_values",)),
-]
-"""Source: NV5, ENVI Header Files, as of `reflectance scale factor`."""
 
 
 def is_envi_header(path: Path) -> bool:
@@ -133,7 +135,7 @@ def _described(file: SpectralFile, header_path: Path, header: dict[str, str]) ->
     bands = check_bands(stated, num_bands, warnings)
     if bands.wavelengths_nm is None and own.wavelengths_nm is not None:
         bands = replace(own, bad=own.bad if bands.bad is None else bands.bad)
-    linear = state_linear(header_path, num_bands, header, "header field", _GAINS_AND_OFFSETS, warnings)
+    linear = state_linear(header_path, num_bands, header, "header field", Format.ENVI, warnings)
     factors = [key for key in header if key.endswith("scale factor") and key != "reflectance scale factor"]
     factors = [key for key in factors if header[key].strip("{} ") not in ("1", "1.0")]
     warnings += [f"'{key}' is {header[key]}: not applied, as ENVI knows no such field" for key in factors]

@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int
 
-from unmix_plugin.captures.header_values import exposure_facts
+from unmix_plugin.captures.fields import exposure_facts
 from unmix_plugin.captures.names import natural_order
 from unmix_plugin.captures.numbers import Decoded, Numbers
 from unmix_plugin.captures.spectral_file import BandTable, ReadOptions, SpectralFile

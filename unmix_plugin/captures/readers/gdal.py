@@ -12,15 +12,13 @@ from pathlib import Path
 from typing import Any, TypeAlias
 from xml.etree.ElementTree import Element
 
-from unmix_plugin.captures.header_values import check_bands, plain_names, state_bands, state_linear
+from unmix_plugin.captures.fields import Format, check_bands, plain_names, state_bands, state_linear
 from unmix_plugin.captures.spectral_file import Linear, SpectralFile
 from unmix_plugin.errors import counted
 from unmix_plugin.limits import parse_xml, read_bounded
 
 GdalItems: TypeAlias = Mapping[str, Mapping[int | None, str]]
 """Texts by name in lower case, and by band from 0; None for the whole file."""
-_GAINS = ("scale", "scale_factor", "gain", "data_gain_values")
-_OFFSETS = ("offset", "add_offset", "bias", "data_offset_values")
 _NAMES_BY_ROLE = {"scale": "scale", "offset": "offset", "description": "band_name"}
 """What entries are that GDAL itself marks with a role."""
 _IMAGE_NAME = re.compile(r"SPECTRAL_IMAGE(_VNIR|_SWIR)?$")
@@ -72,8 +70,8 @@ def gdal_linear(
     """Gains and offsets, where bands may lack their own. Raises CaptureError: they are no numbers, or impossible."""
     entries = gdal_entries(items)
     for name, key in plain_names(items).items():
-        if name in (*_GAINS, *_OFFSETS) and set(items[key]) != {None}:
-            usual = items[key].get(None, "1" if name in _GAINS else "0")
+        if name in (*Format.GDAL.gains, *Format.GDAL.offsets) and set(items[key]) != {None}:
+            usual = items[key].get(None, "1" if name in Format.GDAL.gains else "0")
             lacking = num_bands - len(items[key].keys() - {None})
             if lacking > 0 and None not in items[key]:
                 warnings.append(
@@ -81,7 +79,7 @@ def gdal_linear(
                     f"taken for {usual}, and their values may be off by a factor"
                 )
             entries[key] = [items[key].get(band, usual) for band in range(num_bands)]
-    return state_linear(path, num_bands, entries, where, [(_GAINS, _OFFSETS)], warnings)
+    return state_linear(path, num_bands, entries, where, Format.GDAL, warnings)
 
 
 def gdal_number(text: str) -> float | None:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from unmix_plugin.captures.camera_tags import parse_xmp, with_camera_tags
-from unmix_plugin.captures.header_values import exposure_facts
+from unmix_plugin.captures.fields import exposure_facts
 from unmix_plugin.captures.numbers import Decoded, Numbers
 from unmix_plugin.captures.spectral_file import (
     COLOURS_AS_STORED,

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 
 from unmix_plugin.captures.camera_tags import camera_tags, with_camera_tags
-from unmix_plugin.captures.header_values import StatedBands, check_bands, exposure_facts, state_bands
+from unmix_plugin.captures.fields import StatedBands, check_bands, exposure_facts, state_bands
 from unmix_plugin.captures.numbers import Axes, Block, Decoded, Mapped, Numbers
 from unmix_plugin.captures.readers.arrays import choose_axes, image_shape
 from unmix_plugin.captures.readers.gdal import gdal_entries, gdal_items, gdal_linear, gdal_number

@@ -1,7 +1,8 @@
-"""What headers say of bands, of what numbers stand for, and of exposures, under many names and in many units.
+"""What entries of all formats mean: of bands, of what numbers stand for, and of exposures, under many names and in many
+units.
 
 Every reader brings what a file says to *entries*: texts (of lists with commas), numbers or lists by name, in any case,
-with spaces or `_`. `state_bands`, `state_linear` and `exposure_facts` look them up by one table of names; `check_bands`
+with spaces or `_`. `state_bands`, `state_linear` and `exposure_facts` look them up by the tables here; `check_bands`
 converts and checks. What is left out, and why, is appended to the reader's list of warnings.
 
 Specim writes `tint = 10.5` (milliseconds), others `integration time = 5 ms`, `exposure_us = 8000`, `Exposure Time (s)`.
@@ -15,6 +16,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from enum import Enum
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +37,64 @@ NAMES = re.compile(r"band_?names?")
 _PARTS = r"[,;\s]"
 """What parts the items of a text."""
 _DIVISOR = "reflectance_scale_factor"
-"""Stored number of full reflectance, under the same name everywhere."""
+"""Stored number of full reflectance, under the same name everywhere. Source: NV5, ENVI Header Files."""
+_CF_FACTOR = "scale_factor"
+"""In this spelling always multiplies. Source: CF conventions, 8.1."""
+
+
+@dataclass(frozen=True)
+class GainFields:
+    """Names of entries by which value = gain * stored + offset, one a band or one for all; the first found counts."""
+
+    gains: tuple[str, ...]
+    """Multiply."""
+    offsets: tuple[str, ...]
+    """Are added."""
+    source: str
+    """Who says so."""
+    divide_above_one: tuple[str, ...] = ()
+    """Of the gains, those of which a single number above 1 without an offset divides, unless CF's spelling says that it
+    multiplies: NEON's `Scale_Factor` of 10000."""
+
+
+class Format(Enum):
+    """Whose entries are looked up; of several fields the first that are stated are applied."""
+
+    ENVI = (
+        GainFields(
+            ("data_reflectance_gain_values",), ("data_reflectance_offset_values",), "NV5, ENVI Header Files"
+        ),
+        GainFields(("data_gain_values",), ("data_offset_values",), "NV5, ENVI Header Files"),
+    )
+    GDAL = (
+        GainFields(
+            ("scale", "scale_factor", "gain", "data_gain_values"),
+            ("offset", "add_offset", "bias", "data_offset_values"),
+            "GDAL, Raster Data Model: scale and offset; XML of EnMAP and DESIS",
+        ),
+    )
+    ARRAYS = (
+        GainFields(
+            ("scale_factor", "scalefactor", "scale", "gain", "gains", "slope"),
+            ("add_offset", "offset", "offsets", "bias", "intercept"),
+            "CF conventions, 8.1; NEON, Spectrometer orthorectified surface reflectance",
+            divide_above_one=("scale_factor", "scalefactor", "scale"),
+        ),
+    )
+
+    @property
+    def gains(self) -> tuple[str, ...]:
+        """All names of gains."""
+        return tuple(name for fields in self.value for name in fields.gains)
+
+    @property
+    def offsets(self) -> tuple[str, ...]:
+        """All names of offsets."""
+        return tuple(name for fields in self.value for name in fields.offsets)
+
+
+OF_ALL_IMAGES = (_CF_FACTOR, _DIVISOR, "add_offset")
+"""Names that hold for all images of a file of arrays; others mean this only beside the numbers themselves."""
 _LEAST_WIDTH_NM = 0.05
 """Widths below this are in another unit, as are those wider than their wavelengths."""
 _UNUSABLE = "the file gives no wavelengths that can be used, see the notes"
@@ -51,8 +110,13 @@ def plain_names(entries: Mapping[str, Any]) -> dict[str, str]:
     """
     named: dict[str, str] = {}
     for key in entries:
-        named.setdefault(re.sub(r"[\s_]+", "_", re.split(r"[/#]", key)[-1].lower()), key)
+        named.setdefault(named_by(key), key)
     return named
+
+
+def named_by(key: str) -> str:
+    """The plain name of an entry."""
+    return re.sub(r"[\s_]+", "_", re.split(r"[/#]", key)[-1].lower())
 
 
 def listed(value: Any, separators: str = _PARTS) -> list[Any]:
@@ -145,21 +209,24 @@ def state_linear(
     num_bands: int,
     entries: Mapping[str, Any],
     where: str,
-    pairs: Sequence[tuple[Sequence[str], Sequence[str]]],
+    format_of: Format,
     warnings: list[str],
 ) -> Linear | None:
     """Gains and offsets among entries, or one factor that divides. A lone `gain` is a part of the exposure.
 
     Args:
         where: What entries are, for people.
-        pairs: Plain names of gains and of offsets; those of an earlier pair go before others.
     Raises:
         CaptureError: they are no numbers, impossible, or there is a factor beside gains or a large offset.
     """
     named, found, has_gains = plain_names(entries), [], False
-    for pair in pairs:
+    for fields in format_of.value:
+        pair = fields.gains, fields.offsets
         keys = [next((named[name] for name in names if name in named), "") for names in pair]
         gains, offsets = (_floats(path, f"{where} '{key}'", entries.get(key, "")) for key in keys)
+        may_divide = keys[0] != _CF_FACTOR and named_by(keys[0]) in fields.divide_above_one and not keys[1]
+        if may_divide and len(gains) == 1 and gains[0] > 1:
+            gains = [1 / gains[0]]
         if len(gains) == 1 and not offsets and named.get("gain") == keys[0]:
             continue
         stated = " and ".join(
