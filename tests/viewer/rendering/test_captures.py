@@ -190,7 +190,13 @@ def test_the_words_are_those_of_the_command(tmp_path):
 @pytest.fixture
 def run_instead(monkeypatch):
     """Run Python code in place of the command."""
-    return lambda code: monkeypatch.setattr(captures, "_LAUNCH", code)
+
+    def run(code):
+        monkeypatch.setattr(
+            captures, "child_command", lambda _module, argv: [sys.executable, "-c", code, *argv]
+        )
+
+    return run
 
 
 class Ending:
