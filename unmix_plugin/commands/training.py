@@ -5,16 +5,16 @@ After training the course of the loss is told in words: whether it settled, and 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Any, get_type_hints
+from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from unmix_plugin.engine.configs import TrainerConfig
+from unmix_plugin.engine.configs import TrainerConfig, settings_of
 from unmix_plugin.engine.printing import tell
 from unmix_plugin.engine.registry import MethodSpecification, find_method
 from unmix_plugin.errors import ConfigError, counted, did_you_mean
@@ -100,7 +100,13 @@ def _with_settings(config: TrainerConfig, settings: Mapping[str, Any]) -> Traine
     """The settings changed by name, as the command line names them; hyphens and underscores are alike."""
     from unmix_plugin.engine.runs.config_json import config_from_json, config_to_json
 
-    known, tree, given = dict(_names(config)), {}, {}
+    known: dict[str, tuple[str, ...]] = {}
+    for setting in settings_of(config):
+        if tyro.conf.Suppress not in setting.marks:
+            aliases = [alias for mark in setting.marks for alias in getattr(mark, "aliases", None) or ()]
+            short = (alias.lstrip("-").replace("-", "_") for alias in aliases)
+            known |= dict.fromkeys([".".join(setting.path), *short], setting.path)
+    tree, given = {}, {}
     method = config.method_name
     for name, value in settings.items():
         plain = name.replace("-", "_")
@@ -124,21 +130,6 @@ def _with_settings(config: TrainerConfig, settings: Mapping[str, Any]) -> Traine
     return with_limits_given(
         changed, steps=("max_num_iterations",) in given, seconds=("max_seconds",) in given
     )
-
-
-def _names(config: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, tuple[str, ...]]]:
-    """What a setting can be called, and where in the tree it is."""
-    hints = get_type_hints(type(config), include_extras=True)
-    for entry in fields(config):
-        marks = getattr(hints[entry.name], "__metadata__", ())
-        value, here = getattr(config, entry.name), (*path, entry.name)
-        if is_dataclass(value):
-            yield from _names(value, here)
-        elif tyro.conf.Suppress not in marks and not entry.name.startswith("_"):
-            yield ".".join(here), here
-            for mark in marks:
-                for alias in getattr(mark, "aliases", None) or ():
-                    yield alias.lstrip("-").replace("-", "_"), here
 
 
 def prepare(config: TrainerConfig, console: Console, processes: Processes | None = None) -> Trainer:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from importlib import import_module
 from pathlib import Path
@@ -247,16 +247,40 @@ class TrainerConfig:
         return min(1.0, max(parts))
 
 
-def refuse_changes_at_start(before: Any, now: Any, flag: str = "--") -> None:
+@dataclass(frozen=True)
+class Setting:
+    """One setting in a tree of configs."""
+
+    path: tuple[str, ...]
+    """Names of the fields that lead to it."""
+    value: Any
+    marks: tuple[Any, ...]
+    """Annotations of its field, such as `AtStart` and `short`."""
+
+    @property
+    def flag(self) -> str:
+        """What it is called on the command line."""
+        return "--" + ".".join(self.path).replace("_", "-")
+
+
+def settings_of(config: Any, path: tuple[str, ...] = ()) -> Iterator[Setting]:
+    """All settings in a tree of configs, in their order; not those that begin with `_`, which say what is set up."""
+    hints = get_type_hints(type(config), include_extras=True)
+    for entry in fields(config):
+        value, here = getattr(config, entry.name), (*path, entry.name)
+        if is_dataclass(value) and not isinstance(value, type):
+            yield from settings_of(value, here)
+        elif not entry.name.startswith("_"):
+            yield Setting(here, value, getattr(hints[entry.name], "__metadata__", ()))
+
+
+def refuse_changes_at_start(before: Any, now: Any) -> None:
     """Compare the settings of a run with those to go on with. Raises ConfigError: one differs that is annotated with
     `AtStart`, and would be written down without having acted."""
-    hints = get_type_hints(type(now), include_extras=True)
-    for name in (entry.name for entry in fields(now)):
-        old, new, own = getattr(before, name, None), getattr(now, name), flag + name.replace("_", "-")
-        if is_dataclass(new):
-            refuse_changes_at_start(old, new, f"{own}.")
-        elif AtStart in getattr(hints[name], "__metadata__", ()) and old != new:
+    old = {setting.path: setting.value for setting in settings_of(before)}
+    for setting in settings_of(now):
+        if AtStart in setting.marks and old.get(setting.path) != setting.value:
             raise ConfigError(
-                f"{own} is {new}, and the run to go on with was started with {old}: it acts when "
-                "a run is started alone; leave it out, or start a new run"
+                f"{setting.flag} is {setting.value}, and the run to go on with was started with "
+                f"{old.get(setting.path)}: it acts when a run is started alone; leave it out, or start a new run"
             )

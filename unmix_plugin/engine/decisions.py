@@ -8,8 +8,10 @@ answer: then the safer course is taken, and the table says so.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
+
+from unmix_plugin.engine.configs import settings_of
 
 UNDECIDED = "undecided"
 """The outcome of a decision whose evidence speaks for neither side."""
@@ -47,13 +49,12 @@ def settled_settings(before: Any, after: Any, path: str) -> Iterator[Decision]:
         before, after: Settings, dataclasses of one class that may hold others.
         path: Of their flags, such as `pipeline.model`.
     """
-    for entry in fields(before):
-        old, new = getattr(before, entry.name), getattr(after, entry.name)
-        name = f"{path}.{entry.name}".replace("_", "-")
-        if is_dataclass(old) and type(old) is type(new):
-            yield from settled_settings(old, new, name)
-        elif isinstance(old, str) and old == "auto" and new != old:
-            yield Decision(entry.name.replace("_", "-"), _brief(new), flag=f"--{name}")
+    asked = {setting.path: setting.value for setting in settings_of(before)}
+    for setting in settings_of(after):
+        old = asked.get(setting.path)
+        if isinstance(old, str) and old == "auto" and setting.value != old:
+            name = setting.path[-1].replace("_", "-")
+            yield Decision(name, _brief(setting.value), flag=setting.flag.replace("--", f"--{path}.", 1))
 
 
 def _brief(value: Any) -> str:
