@@ -17,7 +17,7 @@ from torch import Tensor
 
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.evidence import brightness
-from unmix_plugin.spectral.unmixing.num_materials import estimate_noise
+from unmix_plugin.spectral.noise import estimate_noise
 
 _FEWEST_SPECTRA = 4
 """That three components need."""

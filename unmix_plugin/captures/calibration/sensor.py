@@ -494,19 +494,17 @@ def _drop_found(choice: _BandChoice, sample: _Sample, max_noise: float, remarks:
 
 
 def _noise_shares(values: Float32[np.ndarray, "N B"]) -> Float64[np.ndarray, " B"]:
-    """Noise of each band over its signal, from what the other bands can't explain; NaN with too few pixels.
+    """Noise of each band over its signal, its root mean square, from what the other bands can't explain; NaN with too
+    few pixels."""
+    import torch
 
-    The residual of a band's regression on all others has variance 1 / (C^-1)_bb, with C the matrix of their second
-    moments. Signal is the root mean square of the band.
-    Source: Bioucas-Dias & Nascimento 2008, HySime, noise estimation.
-    """
+    from unmix_plugin.spectral.noise import estimate_noise
+
     count, bands = values.shape
     if count < 4 * bands or bands < 8:
         return np.full(bands, np.nan)
     pixels = values.astype(np.float64)
     size = np.sqrt((pixels**2).mean(axis=0))
     size[size == 0] = 1.0
-    pixels = pixels / size
-    moments = pixels.T @ pixels / count
-    inverse = np.linalg.inv(moments + 1e-9 * np.eye(bands))
-    return np.sqrt(1.0 / np.diag(inverse))
+    noise = estimate_noise(torch.from_numpy(pixels / size)).numpy()
+    return np.sqrt((noise**2).mean(axis=0))

@@ -19,6 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from unmix_plugin.errors import SpectrumError
+from unmix_plugin.spectral.noise import estimate_noise
 from unmix_plugin.spectral.unmixing.two_material_mixtures import two_material_fits
 
 LEAST_BANDS = 8
@@ -119,16 +120,3 @@ def _noise_distance(pixels: Float[Tensor, "N B"]) -> float:
     num_bands = pixels.shape[1]
     lengths = estimate_noise(pixels).norm(dim=1) / pixels.norm(dim=1)
     return float(lengths.double().mean()) * math.sqrt((num_bands - 2) / num_bands)
-
-
-def estimate_noise(pixels: Float[Tensor, "N B"]) -> Float[Tensor, "N B"]:
-    """What of each band the other bands can't predict linearly (Bioucas-Dias and Nascimento 2008, algorithm 1)."""
-    data = pixels.double()
-    num_bands = data.shape[1]
-    correlation = data.T @ data
-    # A trace on the diagonal keeps bands that depend on each other exactly from being inverted into infinities.
-    trace = 1e-12 * correlation.diagonal().mean().clamp(min=1e-300)
-    inverse = torch.linalg.inv(correlation + trace * torch.eye(num_bands).to(data))
-    # By the block inverse, row b of the inverse divided by its diagonal holds 1 and minus the coefficients of band b.
-    residual = data @ (inverse / inverse.diagonal()[:, None]).T
-    return residual.to(pixels.dtype)
