@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.commands.running import SMALL_METHOD, done, picture_size
+from tests.commands.running import SMALL_METHOD, done
 from tests.scenes.rig_factory import make_rig
 from unmix_plugin.commands.eval import evaluate
 from unmix_plugin.commands.export import export
@@ -56,7 +56,7 @@ def test_every_band_is_rendered_and_exported_from_every_view(rig_run, tmp_path):
 
 def test_exported_views_have_their_own_pixels(rig_run, tmp_path):
     """Rendered at the larger size of another view, they would show something else beside each measured pixel."""
-    for product in ("cubes", "abundances", "segmentation", "pca"):
+    for product in ("cubes", "abundances", "segmentation"):
         formats = ["--formats", "npy"] if product in ("cubes", "abundances") else []
         done(export, product, "--run", rig_run, "--output", tmp_path / product, *formats)
     scene = load_run(rig_run, "cpu").scene
@@ -67,6 +67,5 @@ def test_exported_views_have_their_own_pixels(rig_run, tmp_path):
         np.testing.assert_array_equal(shares, expected["abundances"])
         ids = np.asarray(Image.open(tmp_path / "segmentation/labels" / f"{view.name}.png"))
         np.testing.assert_array_equal(ids, expected["segmentation"])
-        assert picture_size(tmp_path / "pca" / f"{view.name}.png") == view.camera.size(0)
     sizes = {view.camera.size(0) for view in scene.views if view.split == "eval"}
     assert sizes == {(20, 16), (10, 8)}

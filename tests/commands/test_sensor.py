@@ -84,7 +84,6 @@ def test_known_spectra_are_not_compared_with_broad_channels(solid, camera, tmp_p
         ["abundances", "--formats", "npy", "png", "envi", "exr"],
         ["cubes", "--formats", "npy", "envi", "exr"],
         ["mesh", "--resolution", 24],
-        ["pca"],
         ["point-cloud", "--num-points", 300],
         ["segmentation"],
         ["volume", "--resolution", 8],
@@ -106,7 +105,9 @@ def test_products_that_compare_in_the_runs_own_bands_refuse(solid, camera, tmp_p
     words = ["--view", "0", "--pixel", "1,1"] if name == "spectrum" else []
     said = refused(export, name, *words, "--run", solid.run, "--output", tmp_path / "out", "--sensor", camera)
     assert f"{name} compares with what is known in the run's own bands" in said
-    others = "abundances, cubes, endmembers, mesh, page, pca, point-cloud, poses, regions, segmentation, splats, volume"
+    others = (
+        "abundances, cubes, endmembers, mesh, page, point-cloud, poses, regions, segmentation, splats, volume"
+    )
     assert f"It goes with {others}" in said
     words = ["--run", solid.run, "--output", tmp_path / "out", "--sensor", tmp_path / "none.csv"]
     assert "can't read spectra" in refused(render, *words)

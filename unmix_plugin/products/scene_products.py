@@ -102,17 +102,6 @@ class Page(_ComparedProduct):
 
 
 @dataclass(frozen=True)
-class Pca(Product):
-    """Principal components as colours, the same in all views: VIEW.png, pixel by pixel, and components.csv, which says
-    what red, green and blue stand for."""
-
-    of: Literal["spectra", "abundances"] = "spectra"
-    """What has its components taken."""
-    views: Literal["eval", "train", "all"] = "eval"
-    """Which of the scene's views to render."""
-
-
-@dataclass(frozen=True)
 class PointCloud(Product):
     """The surface as points: points.ply with position and normal in the scene's world coordinates, colour, material and
     every abundance of each point, and with --outputs more numbers."""
@@ -252,7 +241,6 @@ PRODUCTS: tuple[RunWork, ...] = (
     Mesh(),
     Metamerism(),
     Page(),
-    Pca(),
     PointCloud(),
     Poses(),
     Regions(),

@@ -276,3 +276,15 @@ def test_indices_and_targets_are_those_of_the_rendered_spectra_in_every_block(tm
     np.testing.assert_allclose(read[angle][seen], np.arccos(np.clip(cosine[seen], -1, 1)), atol=1e-3)
     assert np.isfinite(read[matched][seen]).all()
     assert set(survey.scores) == {INDEX, matched, angle}
+
+
+def test_scores_of_ace_are_shown_over_the_range_that_they_have(tmp_path):
+    target = tmp_path / "paint.csv"
+    target.write_text("wavelength,paint\n450,0.1\n650,0.9\n")
+    cameras, coherence = views(), f"target:ace:{target}"
+    products, survey, _ = render(tmp_path, [coherence], ["npy"], cameras)
+    values = np.stack([np.load(still_paths(tmp_path, products[0], one.name)[0]) for one in cameras.views])
+    low, high = np.nanquantile(values, [0.01, 0.99])
+    shown = survey.scales[coherence]
+    assert shown.low == pytest.approx(low, abs=0.1 * (high - low))
+    assert shown.high == pytest.approx(high, abs=0.1 * (high - low))

@@ -42,7 +42,9 @@ _EXAMPLES = "paint.csv, ace:paint.csv, mf:paint.csv#gold or 'paint.csv#gold<0.1'
 _SIDES: dict[_DetectionMethod, str] = {"angle": "<", "mf": ">", "ace": ">"}
 """On which side of a threshold a pixel is like the target."""
 _POSSIBLE = {"angle": (0.0, math.pi), "mf": (-math.inf, math.inf), "ace": (0.0, 1.0)}
-_USUAL = {"angle": (0.0, 0.5), "mf": (0.0, 1.0), "ace": (0.0, 1.0)}
+_USUAL = {"angle": (0.0, 0.5), "mf": (0.0, 1.0), "ace": None}
+"""What pictures show; of `ace` the range that there is: a target that most resembles its background differs from it in
+all pixels but has small scores."""
 _LABELS: dict[_DetectionMethod, tuple[str, str]] = {
     "angle": ("spectral angle in radians to", "0 = the same but for brightness"),
     "mf": ("matched filter score of", "1 = like the target, 0 = like the background's mean"),
@@ -140,8 +142,8 @@ class _Target:
         return f"{score} '{self.name}' ({self.file}) {side} {self.threshold:g}: 1 = yes, 0 = no"
 
     @property
-    def usual_range(self) -> tuple[float, float]:
-        """What pictures show."""
+    def usual_range(self) -> tuple[float, float] | None:
+        """What pictures show; None: whatever range there is."""
         return _USUAL[self.method] if self.threshold is None else (0.0, 1.0)
 
     def fit(
