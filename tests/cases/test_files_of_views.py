@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import h5py
 import numpy as np
 import OpenEXR
@@ -11,6 +13,7 @@ from PIL import Image
 
 from tests.captures.file_factory import gdal_items, gdal_tag
 from tests.cases.inputs import (
+    FOCAL_PX,
     HEIGHT,
     RED_GREEN_BLUE,
     VIEWS,
@@ -144,6 +147,79 @@ def test_the_layer_that_a_spectral_exr_means_is_taken(kind, tmp_path):
         exr(tmp_path / f"{name}.exr", rgb(values) | more_layers(kind, values))
     write_transforms(tmp_path / "transforms.json", NAMES)
     cubes(tmp_path, output=tmp_path / "scene").check_values(cube_of)
+
+
+def test_layers_that_no_standard_names_are_asked_for(tmp_path):
+    for index, name in enumerate(NAMES):
+        values, gains = cube(index).astype(np.float32), {"albedo": 0.5, "beauty": 1.0, "specular": 0.1}
+        layers = {
+            key: one for layer, gain in gains.items() for key, one in spectral(layer, values, gain).items()
+        }
+        exr(tmp_path / f"{name}.exr", rgb(values) | layers)
+    write_transforms(tmp_path / "transforms.json", NAMES)
+    words = "cubes", "--data", tmp_path, "--poses", "transforms.json"
+    message = not_processed(*words, output=tmp_path / "scene")
+    assert all(layer in message for layer in ("albedo", "beauty", "specular"))
+    assert "--dataset" in message
+    processed(*words, "--dataset", "beauty", output=tmp_path / "scene").check_values(cube_of)
+
+
+def window_of(index):
+    """First and last row and column of the part of a picture that was rendered."""
+    return 2, HEIGHT - 4, 3 + index, WIDTH - 8 + index
+
+
+def test_the_window_of_an_exr_lies_where_it_belongs(tmp_path):
+    for index, name in enumerate(NAMES):
+        top, bottom, left, right = window_of(index)
+        part = cube(index).astype(np.float32)[top : bottom + 1, left : right + 1]
+        windows = {
+            "dataWindow": (np.array([left, top], np.int32), np.array([right, bottom], np.int32)),
+            "displayWindow": (np.array([0, 0], np.int32), np.array([WIDTH - 1, HEIGHT - 1], np.int32)),
+        }
+        exr(tmp_path / f"{name}.exr", spectral("S0", part), **windows)
+    write_transforms(tmp_path / "transforms.json", NAMES)
+    scene = cubes(tmp_path, "--mask", "none", output=tmp_path / "scene")
+    for view in scene.views:
+        top, bottom, left, right = window_of(number_of(view.name))
+        assert (view.entries["fl_x"], view.entries["cx"], view.entries["cy"]) == (
+            FOCAL_PX,
+            WIDTH / 2,
+            HEIGHT / 2,
+        )
+        inside = np.zeros((HEIGHT, WIDTH), bool)
+        inside[top : bottom + 1, left : right + 1] = True
+        factor = (view.values * cube_of(view.name))[inside].sum() / np.square(
+            cube_of(view.name)[inside]
+        ).sum()
+        assert np.abs(view.values / factor - cube_of(view.name))[inside].max() < 0.02
+        assert not view.values[~inside].any()
+
+
+@pytest.mark.parametrize("compression", ["deflate", "lzw"])
+def test_compressed_strips_hold_what_was_stored(compression, tmp_path):
+    told = "wavelengths = " + ", ".join(f"{nm:g}" for nm in WAVELENGTHS_NM)
+    for index, name in enumerate(NAMES):
+        tifffile.imwrite(
+            tmp_path / f"{name}.tif",
+            np.moveaxis(np.rint(cube(index) * 10000).astype(np.uint16), -1, 0),
+            photometric="minisblack",
+            rowsperstrip=5,
+            compression=compression,
+            description=told,
+        )
+    write_transforms(tmp_path / "transforms.json", NAMES)
+    cubes(tmp_path, output=tmp_path / "scene").check_values(cube_of)
+
+
+def test_a_gain_that_only_some_views_state_is_warned_of(tmp_path):
+    for index, name in enumerate(NAMES):
+        stored = counts(cube(index), LAMP, 0)
+        stated: dict[str, Any] = {"tint": 10.0, "gain": 2.0} if index % 2 else {"tint": 10.0}
+        write_envi(tmp_path / f"{name}.hdr", stored, **stated)
+    write_transforms(tmp_path / "transforms.json", NAMES)
+    scene = cubes(tmp_path, output=tmp_path / "scene")
+    assert any("looks wrong" in line and "gain" in line for line in scene.printed.splitlines())
 
 
 def test_a_header_beside_a_tiff_describes_it(tmp_path):
