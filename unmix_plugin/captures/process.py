@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from unmix_plugin.captures.calibration.references import require_comparable
+from unmix_plugin.captures.decisions import decisions_of
 from unmix_plugin.captures.finding_poses import check_pose_options, marked_poses, poses_of_written_views
 from unmix_plugin.captures.match_checks import views_of_other_poses
 from unmix_plugin.captures.options import GONE_LAYOUTS, LAYOUTS, ProcessOptions, find_views
@@ -44,6 +45,7 @@ from unmix_plugin.captures.wavelengths import parse_wavelengths
 from unmix_plugin.captures.writing.resampling import Resampling
 from unmix_plugin.captures.writing.scene_files import RECORD_NAME, match_views, seen_views, write_scene_files
 from unmix_plugin.captures.writing.view_files import ViewRecord, write_view
+from unmix_plugin.engine.decisions import decision_table
 from unmix_plugin.engine.runs.atomic_files import make_folder, write_errors_as, write_file
 from unmix_plugin.engine.runs.replacing import (
     TEMPORARY,
@@ -132,7 +134,11 @@ def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list
         left_out |= {name: remark for name, remark in others.items() if name not in options.keep_view}
         posed = replace(posed, views=tuple(_without(posed.views, left_out)))
         matched = matched.without(left_out)
-    findings = write_scene_files(folder.path, plan, posed, records, options, matched, [*left_out.values()])
+    reasons = [*left_out.values()]
+    decided = decisions_of(plan, posed, reasons, options)
+    for line in decision_table(decided):
+        say(line)
+    findings = write_scene_files(folder.path, plan, posed, records, options, matched, reasons, decided)
     return [*findings, *folder.finish(options.overwrite)]
 
 

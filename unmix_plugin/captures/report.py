@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 from enum import Enum, unique
 from typing import Any
 
+from unmix_plugin.engine.decisions import Decision, decision_table
 from unmix_plugin.errors import counted, name_some
 
 _WIDTH = 110
@@ -209,8 +210,14 @@ def sentences(remarks: Iterable[Remark], kind: Kind) -> list[str]:
     return [remark.sentence for remark in merged(remarks) if remark.code.kind is kind]
 
 
-def report_text(title: str, wrong: Sequence[str], measured: Sequence[str], done: Sequence[str]) -> str:
-    """One page of text: what looks wrong, what was measured, what was done."""
+def report_text(
+    title: str,
+    wrong: Sequence[str],
+    measured: Sequence[str],
+    done: Sequence[str],
+    decided: Sequence[Decision] = (),
+) -> str:
+    """One page of text: what looks wrong, what was decided, what was measured, what was done."""
     wrong, parts = wrong or ["none of the checks found a fault"], [title, ""]
     for heading, lines in zip(Kind, (wrong, measured, done), strict=True):
         parts.append(heading.value)
@@ -219,4 +226,13 @@ def report_text(title: str, wrong: Sequence[str], measured: Sequence[str], done:
             for line in lines
         ]
         parts.append("")
+        if heading is Kind.WRONG and decided:
+            indent = " " * (max(len(one.subject) for one in decided) + 11)
+            table = decision_table(decided)
+            parts += ["What was decided"]
+            parts += [
+                textwrap.fill(line, _WIDTH, subsequent_indent=indent, break_long_words=False)
+                for line in table
+            ]
+            parts.append("")
     return "\n".join(parts)

@@ -29,6 +29,7 @@ from unmix_plugin.captures.report import Kind, Remark, report_text, sentences
 from unmix_plugin.captures.spectral_file import CaptureView
 from unmix_plugin.captures.value_checks import ViewSample, check_files, check_values
 from unmix_plugin.captures.writing.view_files import FULL_SCALE, BackgroundRule, ViewRecord
+from unmix_plugin.engine.decisions import Decision
 from unmix_plugin.engine.printing import plot_text, terminal_text
 from unmix_plugin.engine.runs.atomic_files import write_file
 from unmix_plugin.errors import counted, name_some
@@ -81,6 +82,7 @@ def write_scene_files(
     options: ProcessOptions,
     matched: MatchedScene,
     left_out: Sequence[Remark] = (),
+    decided: Sequence[Decision] = (),
 ) -> list[str]:
     """Write transforms.json, light, points, contact sheet, report and record.
 
@@ -88,6 +90,7 @@ def write_scene_files(
         records: Of the views that are written, with some that are left out.
         matched: What the views share that are not left out, of the sensor that took the most.
         left_out: Why views are left out, one each.
+        decided: For the report.
     Returns:
         What looks wrong, one sentence each.
     Raises:
@@ -112,7 +115,9 @@ def write_scene_files(
     done = sentences(left_out, Kind.DONE) + _what_was_done(plan, posed, [view.record for view in seen])
     reasons = {remark.where[0]: remark for remark in left_out}
     spoilt = [record for name, record in records.items() if name in reasons]
-    write_file(folder / _REPORT_NAME, terminal_text(report_text(title, findings, measured, done)).encode())
+    write_file(
+        folder / _REPORT_NAME, terminal_text(report_text(title, findings, measured, done, decided)).encode()
+    )
     write_file(folder / _SHEET_NAME, _contact_sheet(seen, plan.sensors, posed.poses, title, spoilt))
     views = [asdict(view.record) for view in seen]
     totals = ("num_pixels", "saturated_pixels", "missing_pixels", "clipped_values", "negative_values")
@@ -120,6 +125,7 @@ def write_scene_files(
         "made_by": f"unmix-process {__version__}",
         "options": plain_options(options),
         "decisions": plan.decisions,
+        "decided": [decision.to_json() for decision in decided],
         "stored": {"type": "uint16", "value_scale": FULL_SCALE, "calibrated_value_of_1": plan.scale},
         "poses": {"source": posed.poses.source, "notes": list(posed.notes), **posed.keys},
         "notes": list(plan.notes),

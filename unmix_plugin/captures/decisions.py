@@ -1,0 +1,125 @@
+"""The table of all that was decided on a capture: what, from what, what would have spoken against it and was looked
+for, and the option that overrides it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from jaxtyping import Float64
+
+from unmix_plugin.captures.calibration.sensor import Sensor
+from unmix_plugin.captures.options import ProcessOptions
+from unmix_plugin.captures.plan import Plan
+from unmix_plugin.captures.posing import PosedViews
+from unmix_plugin.captures.report import Remark
+from unmix_plugin.engine.decisions import UNDECIDED, Decision
+from unmix_plugin.scenes.backdrops import Backdrop
+
+_MOST_LISTED = 4
+
+
+def decisions_of(
+    plan: Plan, posed: PosedViews, left_out: Sequence[Remark], options: ProcessOptions
+) -> list[Decision]:
+    """All decisions, those on single sensors with their names."""
+    decisions = [_of_views(len(posed.views), left_out)]
+    for name, sensor in plan.sensors.items():
+        decisions += _of_sensor(f" of {name}" if name else "", sensor, options)
+    above = max((float((sensor.sample > plan.scale).mean()) for sensor in plan.sensors.values()), default=0.0)
+    decisions.append(
+        Decision(
+            "scale",
+            f"{plan.scale:g} is written as 1",
+            {"sampled values above": above, "from": plan.decisions["scale"]["evidence"]},
+            "views that are far brighter than most, which it does not follow",
+            "--scale",
+        )
+    )
+    return [*decisions, _of_mask(plan, options), _of_poses(posed, options)]
+
+
+def _of_views(used: int, left_out: Sequence[Remark]) -> Decision:
+    reasons = {remark.where[0]: remark.code.name.removeprefix("VIEW_").lower() for remark in left_out}
+    listed = {name: reasons[name].replace("_", " ") for name in [*reasons][:_MOST_LISTED]}
+    more = {"others": len(reasons) - len(listed)} if len(reasons) > len(listed) else {}
+    return Decision(
+        "views",
+        f"{used} used, {len(reasons)} left out" if reasons else f"all {used} are used",
+        {**listed, **more},
+        "neighbours that are alike, or more than a quarter of the views",
+        "--keep-view, --leave-out",
+    )
+
+
+def _of_sensor(where: str, sensor: Sensor, options: ProcessOptions) -> Iterator[Decision]:
+    facts = sensor.evidence
+    for key, what, against in (
+        ("dark", "dark frame", "values that pile up below 0"),
+        ("white", "white reference", "bands in which it is saturated, dark, or not above the dark frame"),
+    ):
+        if key in facts:
+            evidence = {"file": facts[key]["file"], "use": facts[key]["use"]}
+            yield Decision(
+                f"{what}{where}",
+                "subtracted" if key == "dark" else "divided by",
+                evidence,
+                against,
+                f"--{key}",
+            )
+    exposure = sensor.calibration.exposure
+    yield Decision(
+        f"exposure{where}",
+        "not compared" if exposure is None else f"all brought to {' to '.join(_ends(exposure))} s",
+        {},
+        "a time, gain or f-number that one file states and another lacks; values that are reflectance already",
+    )
+    stored, evidence = facts["saturation"]["stored"], facts["saturation"]["evidence"]
+    yield Decision(
+        f"saturation{where}",
+        UNDECIDED if stored is None else f"from {stored:g}",
+        {"from": evidence},
+        "numbers that are not whole, or none that crowd at the greatest",
+        "--saturation",
+    )
+    dropped = sensor.bands.dropped
+    nm = sensor.bands.wavelengths_nm
+    listed = {f"{nm[band]:g} nm": reason for band, reason in sorted(dropped.items())[:_MOST_LISTED]}
+    more = {"others": len(dropped) - len(listed)} if len(dropped) > len(listed) else {}
+    yield Decision(
+        f"bands{where}",
+        f"{len(sensor.bands.kept)} of {len(nm)} kept",
+        {**listed, **more},
+        f"more than half of the bands noisier than {options.max_noise:g} of their signal",
+        "--drop-bands, --max-noise",
+    )
+
+
+def _ends(exposure: Float64[np.ndarray, " b"]) -> list[str]:
+    return list(dict.fromkeys(f"{number:g}" for number in (exposure.min(), exposure.max())))
+
+
+def _of_mask(plan: Plan, options: ProcessOptions) -> Decision:
+    backdrops = [recipe.background for recipe in plan.recipes.values()]
+    found = [backdrop.in_words for backdrop in backdrops if isinstance(backdrop, Backdrop)]
+    outcome = {"auto": "a backdrop that all views share is cut out", "files": "from files"}.get(
+        plan.mask, plan.mask
+    )
+    return Decision(
+        "mask",
+        outcome if plan.mask != "none" else "none: all of each view is the scene",
+        {"asked": options.mask, **({"backdrop": ", ".join(found)} if found else {})},
+        "borders with texture, or that differ between views" if options.mask == "auto" else "",
+        "--mask",
+    )
+
+
+def _of_poses(posed: PosedViews, options: ProcessOptions) -> Decision:
+    is_estimated = not posed.poses.has_world
+    return Decision(
+        "poses",
+        f"{'estimated' if is_estimated else 'read'}: {posed.poses.source}",
+        {"views": len(posed.views)},
+        "points shared by views that lie elsewhere by the poses",
+        "--poses" if options.poses is None or not is_estimated else "--poses FILE",
+    )
