@@ -24,6 +24,7 @@ from unmix_plugin.captures.poses.pose_set import PosedCamera
 from unmix_plugin.captures.writing.view_files import ViewRecord
 from unmix_plugin.engine.geometry.camera_paths import meeting_point
 from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.sampling import evenly_spaced
 from unmix_plugin.errors import counted, name_some
 from unmix_plugin.scenes.doctor import check_masks, contradicted_share
 from unmix_plugin.spectral.colour.srgb import decode_srgb
@@ -346,8 +347,7 @@ def _masks(views: Sequence[SeenView], _: _Points | None, findings: list[str]) ->
     import torch
     from PIL import Image
 
-    chosen = np.unique(np.linspace(0, len(views) - 1, min(len(views), _MOST_MASKS)).round().astype(int))
-    some = [views[index] for index in chosen.tolist()]
+    some = [views[index] for index in evenly_spaced(len(views), _MOST_MASKS)]
     lenses = [view.camera.lens for view in some if view.camera.lens is not None]
     if len(some) < _LEAST_VIEWS or all(view.record.matter_share == 1.0 for view in some):
         return "masks are not compared: there are too few views, or none has a mask"

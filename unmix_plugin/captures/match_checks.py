@@ -27,6 +27,7 @@ from jaxtyping import Float64, Int
 from unmix_plugin.captures.poses.lens import Lens, Points
 from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera
 from unmix_plugin.captures.report import Code, Remark
+from unmix_plugin.engine.sampling import evenly_spaced
 
 _LONGEST_SIDE_PX = 320
 """Of pictures in which features are found."""
@@ -306,7 +307,7 @@ def _choose_stars(angles_deg: Float64[np.ndarray, "N N"]) -> list[list[int]]:
     low, high = _ANGLES_DEG
     stars = []
     count = len(angles_deg)
-    for view in np.unique(np.linspace(0, count - 1, min(count, _STARS)).round().astype(int)).tolist():
+    for view in evenly_spaced(count, _STARS):
         order = np.argsort(angles_deg[view]).tolist()
         near = [other for other in order if other != view and low <= angles_deg[view, other] <= high]
         if len(near) >= _LEAST_VIEWS - 1:

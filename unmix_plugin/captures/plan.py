@@ -28,6 +28,7 @@ from unmix_plugin.captures.poses.pose_set import PosedCamera, reading
 from unmix_plugin.captures.report import Code, Kind, Remark, sentences
 from unmix_plugin.captures.spectral_file import Capture, CaptureView, SpectralFile
 from unmix_plugin.captures.writing.view_files import BackgroundRule, ViewRecipe, alpha_picture
+from unmix_plugin.engine.sampling import evenly_spaced
 from unmix_plugin.errors import CaptureError, ConfigError, name_some
 from unmix_plugin.scenes.backdrops import Backdrop, judge_backdrop
 from unmix_plugin.scenes.reading.faults import sha256_of
@@ -380,7 +381,6 @@ def _find_backdrop(
     """The backdrop of a sensor's views, judged by some rows of some of them; the sample is of all, divided by scale."""
     raster = sensor.calibration.raster
     rows = np.unique(np.linspace(0, raster.height - 1, min(raster.height, _ROWS_LOOKED_AT)).astype(int))
-    chosen = np.unique(np.linspace(0, len(views) - 1, min(len(views), _LOOKED_AT)).round().astype(int))
 
     def look(index: int) -> tuple[np.ndarray, np.ndarray]:
         parts = [sensor.calibration.rows(views[index].cube, row, row + 1) for row in rows.tolist()]
@@ -388,7 +388,7 @@ def _find_backdrop(
         seen = np.clip(values / np.float32(scale), 0.0, 1.0)
         return seen, ~np.concatenate([part.missing for part in parts])
 
-    return judge_backdrop(map(look, chosen.tolist()), sample)
+    return judge_backdrop(map(look, evenly_spaced(len(views), _LOOKED_AT)), sample)
 
 
 def input_files(view: CaptureView) -> list[Path]:

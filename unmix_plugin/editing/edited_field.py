@@ -26,6 +26,7 @@ from torch import Tensor
 
 from unmix_plugin.editing.recipe import Colour, Endmember
 from unmix_plugin.engine.geometry.space import RayBundle
+from unmix_plugin.engine.sampling import evenly_spaced
 from unmix_plugin.errors import ConfigError, did_you_mean
 from unmix_plugin.field import CoefficientField
 from unmix_plugin.light.lamp import MovingLamp
@@ -49,9 +50,9 @@ _PURITY_EXPONENT = 4
 def sample_seen(scene: TrainedScene) -> Coefficients:
     """What pixels are made of in coarse pictures of a few training views: rows of pixels (N, ...)."""
     cameras = [view.camera for view in scene.views if view.split == "train"]
-    chosen = np.unique(np.linspace(0, len(cameras) - 1, min(_NUM_VIEWS, len(cameras))).round().astype(int))
+    chosen = evenly_spaced(len(cameras), _NUM_VIEWS)
     found = []
-    for camera in (cameras[int(index)] for index in chosen):
+    for camera in (cameras[index] for index in chosen):
         shrink = min(1.0, _LONGEST_SIDE_PX / max(camera.width, camera.height))
         width, height = (max(1, math.floor(side * shrink)) for side in (camera.width, camera.height))
         found.append(scene.look(camera.resized(width, height), subpixels=1).coefficients.flatten())

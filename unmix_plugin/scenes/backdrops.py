@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float32
 
+from unmix_plugin.engine.sampling import evenly_spaced
 from unmix_plugin.scenes.border_surfaces import (
     BORDER_SHARE,
     FIRST_TOLERANCE,
@@ -145,13 +146,12 @@ def find_before_backdrop(views: Views) -> BeforeBackdrop | None:
     stride = -(-max(size) // _LONGEST_SIDE_PX)
     bands = views.read(0, (slice(1), slice(1))).shape[2]
     part = (slice(None, None, stride), slice(None, None, stride), slice(None, None, -(-bands // _MOST_BANDS)))
-    chosen = np.linspace(0, count - 1, min(count, _LOOKED_AT)).round().astype(int)
 
     def read(view: int) -> tuple[np.ndarray, np.ndarray]:
         image = views.read(view, part)
         return image, np.ones(image.shape[:2], bool) if views.valid is None else views.valid(view)[part[:2]]
 
-    looked_at = np.unique(chosen).tolist()
+    looked_at = evenly_spaced(count, _LOOKED_AT)
     sample = [image[::4, ::4][mask[::4, ::4]] for image, mask in map(read, looked_at)]
     backdrop = judge_backdrop(map(read, looked_at), np.concatenate(sample))
     if backdrop is None:

@@ -32,6 +32,7 @@ from unmix_plugin.captures.writing.view_files import FULL_SCALE, BackgroundRule,
 from unmix_plugin.engine.decisions import Decision
 from unmix_plugin.engine.printing import plot_text, terminal_text
 from unmix_plugin.engine.runs.atomic_files import write_file
+from unmix_plugin.engine.sampling import evenly_spaced
 from unmix_plugin.errors import counted, name_some
 from unmix_plugin.figures.pictures import Canvas, CanvasLayout, columns_for
 from unmix_plugin.figures.plotting import FIGURE_DPI, figure_bytes, plain_axes
@@ -379,7 +380,7 @@ def _contact_sheet(
 
 def _tiles(views: Sequence[SeenView], left_out: Sequence[ViewRecord]) -> UInt8[np.ndarray, "H W 3"]:
     root = views[0].picture.parent.parent
-    shown = [views[index] for index in _evenly(len(views), _MOST_VIEWS)]
+    shown = [views[index] for index in evenly_spaced(len(views), _MOST_VIEWS)]
     side_px = int(np.clip(_SHEET_PX / columns_for(len(shown) + len(left_out)), *_TILE_PX))
     files = [(view.picture, view.record) for view in shown]
     files += [(root / record.paths["file_path"], record) for record in left_out]
@@ -395,10 +396,6 @@ def _tiles(views: Sequence[SeenView], left_out: Sequence[ViewRecord]) -> UInt8[n
         row, column = layout.corner(index)
         canvas.pixels[row : row + picture.shape[0], column : column + picture.shape[1]] = picture
     return canvas.pixels
-
-
-def _evenly(count: int, most: int) -> list[int]:
-    return np.linspace(0, count - 1, min(count, most)).round().astype(int).tolist()
 
 
 def _small_picture(picture_file: Path, record: ViewRecord, side_px: int) -> UInt8[np.ndarray, "h w 3"]:
@@ -429,7 +426,7 @@ def _draw_cameras(
     (across, up), points, colours = plane, poses.points, poses.colours
     places, looks = (np.stack([getattr(view, name) for view in views]) for name in ("position", "axis"))
     if points is not None and len(points):
-        kept = _evenly(len(points), _MOST_POINTS)
+        kept = evenly_spaced(len(points), _MOST_POINTS)
         tint = "0.5" if colours is None else np.clip(colours[kept] / 255.0 * 0.8, 0, 1)
         axes.scatter(points[kept, across], points[kept, up], s=1.0, c=tint, linewidths=0)
     arrows = (*places[:, [across, up]].T, *looks[:, [across, up]].T)

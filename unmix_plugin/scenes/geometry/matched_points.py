@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float, Float32, Int
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.sampling import evenly_spaced
 from unmix_plugin.scenes.geometry.lighting import local_log_brightness
 from unmix_plugin.scenes.geometry.views import ThinnedViews, Views
 
@@ -114,9 +115,8 @@ class _Features:
 def _choose_pairs(positions: Float[Tensor, "N 3"]) -> list[tuple[int, int]]:
     """Some views and others beside them, each pair once; views at one place tell no distance."""
     away = torch.cdist(positions.double(), positions.double())
-    chosen = np.linspace(0, len(positions) - 1, min(_MOST_REFERENCES, len(positions))).round().astype(int)
     pairs = set()
-    for view in chosen.tolist():
+    for view in evenly_spaced(len(positions), _MOST_REFERENCES):
         others = [other for other in away[view].argsort().tolist() if away[view, other] > 1e-6 * away.max()]
         for rank in _NEIGHBOUR_RANKS:
             if rank < len(others):

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import RayBundle
+from unmix_plugin.engine.sampling import evenly_spaced
 
 Image = Float[Tensor, "h w F"]
 """Features of a view thinned out, NaN in its gaps."""
@@ -117,9 +118,10 @@ def choose_neighbours(
     ranks = turns + 0.1 * distances / max(float(distances.max()), 1e-30)
     ranks[turns < _SMALLEST_TURN_DEG] += 360.0
     np.fill_diagonal(ranks, np.inf)
-    chosen = np.linspace(0, len(poses) - 1, min(num_references, len(poses))).round().astype(int)
     count = min(num_neighbours, len(poses) - 1)
-    return {int(view): np.argsort(ranks[view])[:count].tolist() for view in chosen}
+    return {
+        view: np.argsort(ranks[view])[:count].tolist() for view in evenly_spaced(len(poses), num_references)
+    }
 
 
 def view_features(views: list[Float[Tensor, "h w B"]], generator: torch.Generator) -> list[Image]:
