@@ -188,10 +188,11 @@ class Viewer:
 
 @contextmanager
 def _interrupting_signals() -> Iterator[None]:
-    """Context in which SIGTERM and SIGHUP act like Ctrl-C; signals that are ignored, as under nohup, stay ignored."""
+    """Context in which Ctrl-C, SIGTERM and SIGHUP all raise KeyboardInterrupt, and are the usual way to end, no reason
+    for an exit code of theirs; signals that are ignored, as under nohup, stay ignored."""
     before = {}
     if threading.current_thread() is threading.main_thread():
-        for name in ("SIGTERM", "SIGHUP"):
+        for name in ("SIGINT", "SIGTERM", "SIGHUP"):
             number = getattr(signal, name, None)  # Windows has no SIGHUP
             if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
                 before[number] = signal.signal(number, signal.default_int_handler)
