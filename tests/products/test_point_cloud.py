@@ -108,7 +108,7 @@ def test_a_comment_says_what_a_property_is_and_whether_the_light_was_known():
     formula, named = _require_point_scores(["index:r650/r450", "index:pri"], BANDS)
     unknown, known = make_model().materials, make_model(light=LIGHT).materials
     [said] = formula.comments(known)
-    assert said == "index_1: index:r650/r450, formula r650/r450; from the bands at 450, 650 nm"
+    assert said == "index_1: index:r650/r450, formula r650/r450, from the bands at 450, 650 nm"
     assert formula.comments(unknown) == [f"{said}; of radiance, since the scene's light is unknown"]
     assert named.comments(known)[0].startswith("index_pri: index:pri, photochemical reflectance index")
 

@@ -15,7 +15,6 @@ from unmix_plugin.trained import measures
 from unmix_plugin.trained.protocol import Probe
 from unmix_plugin.trained.regions import Box
 from unmix_plugin.trained.run_views import RunView
-from unmix_plugin.trained.trained_scene import TrainedScene
 
 CAMERAS = cameras_around([(1.0, 0.2, 0.3), (-1.0, 0.1, 0.5)])
 VIEWS = tuple(RunView(f"view_{index}", camera) for index, camera in enumerate(CAMERAS))
@@ -54,7 +53,7 @@ def test_points_count_on_the_surface_that_views_show():
 
 def test_a_point_in_haze_that_hardly_shows_is_not_on_the_surface():
     place = FRAME.to_world(np.array([0.9, 0.2, 0.3]))
-    hazy = MagicMock(spec=TrainedScene, frame=FRAME, views=VIEWS)
+    hazy = MagicMock(spec=BALL, frame=FRAME, views=VIEWS)
     hazy.probe.return_value = Probe({}, 0.1, None, place)
     with pytest.raises(ConfigError, match="not on the object: no view shows anything there"):
         measures.require_on_surface(hazy, place.tolist())

@@ -37,6 +37,7 @@ from unmix_plugin.trained.run_views import recorded_views, world_frame
 from unmix_plugin.viewer.panels.materials import likeness_rows
 from unmix_plugin.viewer.rendering.scene import Edit, SceneSource
 from unmix_plugin.viewer.rendering.settings import BACKGROUNDS
+from unmix_plugin.viewer.rendering.thumbnails import Thumbnails
 
 
 def put(page, values):
@@ -303,7 +304,7 @@ def test_depth_comes_with_objects_and_goes_with_them(page):
     assert page.notices == []
 
 
-class SlowThumbnails:
+class SlowThumbnails(Thumbnails):
     """Images of views that take as long as a test wants."""
 
     def __init__(self):

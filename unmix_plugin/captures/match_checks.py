@@ -72,7 +72,7 @@ are said to have other poses."""
 
 MatchedView: TypeAlias = tuple[PosedCamera, Path]
 """A camera, with the lens of its picture, and where this lies."""
-_Features: TypeAlias = tuple[Float64[np.ndarray, "F 2"], np.ndarray]
+_Features: TypeAlias = tuple[Float64[np.ndarray, "_ 2"], np.ndarray]
 """Places in pixels of the picture, and descriptors."""
 _Pairs: TypeAlias = dict[tuple[int, int], tuple[Int[np.ndarray, " M"], Int[np.ndarray, " M"]]]
 """Indices of features that match, by the indices of two views."""

@@ -86,7 +86,7 @@ def decision_table(decisions: Sequence[Decision]) -> list[str]:
     return lines
 
 
-def _written(value: float | bool | str) -> str:
+def _written(value: float | int | bool | str) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     return f"{value:.3g}" if isinstance(value, float) else str(value)

@@ -125,8 +125,9 @@ class DataManager(ABC):
         return []
 
 
-TrainOutputs: TypeAlias = tuple[dict[str, Tensor], dict[str, Tensor], dict[str, Tensor]]
-"""Outputs, losses and metrics of one batch."""
+TrainOutputs: TypeAlias = tuple[dict[str, Tensor], dict[str, Any], dict[str, Tensor]]
+"""Outputs, losses and metrics of one batch. Losses may be a plugin's own: the training step checks that they are
+tensors, and names the plugin if they are not."""
 
 
 class Model(nn.Module, ABC):

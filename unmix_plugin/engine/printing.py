@@ -15,7 +15,7 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING, TextIO
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
     from rich.segment import Segment
@@ -36,7 +36,16 @@ def terminal_text(text: str) -> str:
     return _NOT_FOR_TERMINALS.sub("?", text)
 
 
-def tell(text: object = "", file: TextIO | None = None) -> None:
+@runtime_checkable
+class Stream(Protocol):
+    """What text can be printed to: standard streams, and what stands for them in tests."""
+
+    def write(self, text: str, /) -> object: ...
+
+    def flush(self) -> object: ...
+
+
+def tell(text: object = "", file: Stream | None = None) -> None:
     """Print a line, at once; on standard output unless another stream is given."""
     print(terminal_text(str(text)), file=file or sys.stdout, flush=True)
 

@@ -226,7 +226,10 @@ def _pixel_rays(camera: Cameras, coords: Float[Tensor, "P 2"]) -> RayBundle:
 
 
 def _ends_near(
-    rays: RayBundle, distances: Float[Tensor, " P"], points: Float[Tensor, "P 3"], pixels: Float[Tensor, " P"]
+    rays: RayBundle,
+    distances: Float[Tensor, " P"],
+    points: Float[Tensor, "#P 3"],
+    pixels: Float[Tensor, " P"],
 ) -> Bool[Tensor, " P"]:
     ends = rays.origins + distances[:, None] * rays.directions
     return (ends - points).norm(

@@ -30,13 +30,13 @@ from unmix_plugin.engine.training.optimizers import (
 from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.errors import ConfigError, RunError
 
-configs = st.builds(OptimizerConfig, lr=st.floats(1e-5, 1.0), final_factor=st.floats(1e-3, 1.0))
 fractions = st.floats(0.0, 1.0)
 
 
 @settings(deadline=None)
-@given(configs, fractions, fractions)
-def test_a_schedule_falls_by_equal_factors_from_lr_to_its_final_factor(config, a, b):
+@given(st.floats(1e-5, 1.0), st.floats(1e-3, 1.0), fractions, fractions)
+def test_a_schedule_falls_by_equal_factors_from_lr_to_its_final_factor(lr, final_factor, a, b):
+    config = OptimizerConfig(lr=lr, final_factor=final_factor)
     assert math.isclose(_learning_rate(config, -a), config.lr, rel_tol=1e-12)
     assert math.isclose(_learning_rate(config, 1.0 + a), config.lr * config.final_factor, rel_tol=1e-9)
     ratio = _learning_rate(config, a) / _learning_rate(config, b)

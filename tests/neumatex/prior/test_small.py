@@ -193,7 +193,7 @@ def objects(tmp_path_factory) -> prior_objects.TrainingObjects:
     made = [prior_objects.training_object(seed, num_points=64, num_views=4, samples=4) for seed in range(4)]
     prior_objects.write_objects(folder / "first.safetensors", made[:2])
     prior_objects.write_objects(folder / "second.safetensors", made[2:])
-    found = prior_objects.read_objects(sorted(folder.iterdir()))
+    found = prior_objects.read_objects(sorted(folder.glob("*.safetensors")))
     assert_close(found.select([2]).materials, made[2].materials, atol=1e-3, rtol=0)
     return found
 

@@ -161,7 +161,7 @@ def test_overwriting_replaces_the_older_scene_and_spares_other_files(tmp_path):
     (directory / "images" / "mine.png").write_bytes(b"mine")
     demo_scene.make_demo_scene(directory, size=16, bands=4, views=4, overwrite=True)
     names = [f"{demo_scene.frame_name(index)}.npy" for index in range(4)]
-    assert sorted(path.name for path in (directory / "cubes").iterdir()) == sorted(names)
+    assert sorted(path.name for path in (directory / "cubes").glob("[!.]*")) == sorted(names)
     assert np.load(directory / "cubes" / "train_000.npy").shape == (16, 16, 4)
     assert (directory / "notes.txt").read_text() == "mine"
     assert (directory / "images" / "mine.png").exists()

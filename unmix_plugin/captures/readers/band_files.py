@@ -163,11 +163,12 @@ def _exposure_of_bands(parts: Sequence[SpectralFile], warnings: list[str]) -> di
     exposed = [[part.metadata.get(key, usual) for key, usual in _EXPOSURE.items()] for part in parts]
     lacking = [part.path.name for part in parts if "f_number" not in part.metadata]
     without = [part.path.name for part in parts if "gain" not in part.metadata]
-    if 0 < len(without) < len(parts) and any(time is not None for time, *_ in exposed):
+    is_exposed = any(time is not None for time, *_ in exposed)
+    has_gains = is_exposed and 0 < len(without) < len(parts)
+    if has_gains and any(gain != 1.0 for _, gain, _ in exposed):
         unknown = f"the gain is known of some bands and not of {name_some(without)}"
         warnings.append(f"{unknown}: exposures are not compared; write it into all files, or none")
         return {}
-    is_exposed = any(time is not None for time, *_ in exposed)
     is_partial = is_exposed and 0 < len(lacking) < len(parts)
     if is_partial:
         exposed = [[time, gain, 1.0] for time, gain, _ in exposed]
@@ -176,6 +177,11 @@ def _exposure_of_bands(parts: Sequence[SpectralFile], warnings: list[str]) -> di
         unknown = "one exposure time and gain is not known of every band: exposures are not compared"
         warnings += [unknown] if is_exposed else []
         return {}
+    if has_gains:
+        taken = (
+            f"the gain is 1 in some bands and not known of {name_some(without)}, where it is taken for 1, too"
+        )
+        warnings.append(f"{taken}: values may be off by a factor")
     unknown = f"the f-number of the lens is known of some bands and not of {name_some(lacking)}"
     warnings += [f"{unknown}: exposures are compared without it"] if is_partial else []
     if is_same:

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -175,7 +176,7 @@ class TrainingSteps:
         return total, None if wanted is None else max(1, int(rays))
 
 
-def _require_losses(losses: Mapping[str, Tensor], kind: type) -> None:
+def _require_losses(losses: Mapping[str, Any], kind: type) -> None:
     """Refuse losses of a model of this class that can't be added up. Raises ConfigError: naming the class and where it
     is written."""
     if not losses:
