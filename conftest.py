@@ -39,3 +39,5 @@ def pytest_collection():
     finally:
         gc.freeze()
         gc.enable()
+        # The module of the console scripts, imported for its doctests, lets Ctrl-C end its process at once.
+        signal.signal(signal.SIGINT, signal.default_int_handler)

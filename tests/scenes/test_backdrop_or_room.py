@@ -29,7 +29,9 @@ Place3 = tuple[float, float, float]
 
 
 def slab(center: Place3, half: Place3, material: str, turn_deg: float = 0.0) -> Thing:
-    placement = Placement("box", center, half, turn_deg=turn_deg)
+    x, y, z = (float(place) for place in center)
+    across, along, high = (float(size) for size in half)
+    placement = Placement("box", (x, y, z), (across, along, high), turn_deg=turn_deg)
     return Thing(placement, Surface(material, material, plain))
 
 

@@ -199,8 +199,14 @@ def _signals_as_exits(noted: list[int]) -> Iterator[None]:
     try:
         yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        # What comes meanwhile waits: Python would say that it ignores a signal whose handler is being taken away.
+        hold = getattr(signal, "pthread_sigmask", lambda *_: None)
+        try:
+            hold(getattr(signal, "SIG_BLOCK", 0), before)
+            for number, handler in before.items():
+                signal.signal(number, handler)
+        finally:
+            hold(getattr(signal, "SIG_UNBLOCK", 0), before)
 
 
 _SAME_SIGNAL_S = 0.3

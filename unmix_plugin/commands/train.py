@@ -155,7 +155,7 @@ def train(argv: list[str]) -> None:
                     resume = shell_line(_PROGRAM, config.method_name, "--load-run", stop.run)
                     tell(f"go on with: {resume}", file=sys.stderr)
                 tell(f"run: {stop.run}")
-                sys.exit(INTERRUPTED)
+                sys.exit(INTERRUPTED if stop.signal_number is None else 128 + stop.signal_number)
         tell(f"run: {trainer.run.path}")
 
 

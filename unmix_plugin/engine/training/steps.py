@@ -245,7 +245,7 @@ def follow_training(config: TrainerConfig, processes: Processes) -> TrainingStep
                 step = steps.restore(newest_complete_checkpoint(checkpoints)).steps
         steps.pipeline.model.warm_up()
         # A terminal's Ctrl-C reaches all processes; the first decides when to stop, and saves.
-        with stop_signals():
+        with stop_signals([]):
             steps.begin(step)
             while (progress := processes.announce(None)) is not None:
                 steps.take(step, progress)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import time
 from contextlib import nullcontext, suppress
 from dataclasses import replace
@@ -132,6 +133,7 @@ class Trainer:
                 an older one.
             RunError: the disk is full, or loss and gradients stay non-finite.
         """
+        signals: list[int] = []
         keep_freed_memory()  # not while the scene is read, whose largest arrays are gone before training begins
         try:
             with self.control.device.training_turn():
@@ -139,11 +141,12 @@ class Trainer:
             self.steps.begin(self.step)
             adopt_run_json(self.run.training_path)
             remove(self.run.training_path)  # of the training that this one goes on with
-            with stop_signals() as signals, ProgressDisplay(self.console) as display, self.control.running():
+            with stop_signals(signals), ProgressDisplay(self.console) as display, self.control.running():
                 self._loop(signals, display)
         except KeyboardInterrupt as error:
             steps = checkpoint_steps(self.run.checkpoints)
-            raise Interrupted(self.run.path, steps[0] if steps else None) from error
+            first = signals[0] if signals else signal.SIGINT
+            raise Interrupted(self.run.path, steps[0] if steps else None, first) from error
         except Interrupted:
             raise
         except Exception as error:
@@ -204,7 +207,7 @@ class Trainer:
             control.request_stop()  # also where a signal asked for it: pages show what has become of the training
             reason = "its output is closed" if display.is_closed else "on request"
             self._log(f"stopped at step {self.step}: {reason}")
-            raise Interrupted(self.run.path, self.step)
+            raise Interrupted(self.run.path, self.step, signals[0] if signals else None)
 
     def _iterate(self, display: ProgressDisplay) -> None:
         """A step, and whatever is shown, written or measured after it."""

@@ -213,8 +213,10 @@ class TrainingControl:
 class Interrupted(Exception):  # noqa: N818
     """Training was stopped on request; the run can be resumed."""
 
-    def __init__(self, run: Path, step: int | None) -> None:
+    def __init__(self, run: Path, step: int | None, signal_number: int | None) -> None:
         super().__init__(f"stopped; {'no checkpoint' if step is None else f'step {step}'} is saved in {run}")
+        self.signal_number = signal_number
+        """The signal that asked for it; None where none did."""
         self.run = run
         """The run folder."""
         self.step = step
@@ -226,7 +228,7 @@ _SAME_SIGNAL_S = 0.3
 
 
 @contextmanager
-def stop_signals() -> Iterator[list[int]]:
+def stop_signals(noted: list[int]) -> Iterator[None]:
     """Context in which Ctrl-C, SIGTERM or SIGHUP is only noted in the list, and a second one raises KeyboardInterrupt.
 
     A lost terminal often sends SIGHUP twice, so that a second one of these changes nothing; under nohup it stays
@@ -234,7 +236,6 @@ def stop_signals() -> Iterator[list[int]]:
     what comes at once counts once. In a thread that is not the main one signals can't be caught, and nothing is ever
     noted.
     """
-    noted: list[int] = []
     noted_at, same_s = 0.0, _SAME_SIGNAL_S if "WORLD_SIZE" in os.environ else 0.0
 
     def note(number: int, _frame: FrameType | None) -> None:
@@ -252,4 +253,4 @@ def stop_signals() -> Iterator[list[int]]:
     if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is signal.SIG_IGN and names:
         names.remove("SIGHUP")
     with handled_signals(dict.fromkeys(names, note)):
-        yield noted
+        yield
