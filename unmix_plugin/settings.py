@@ -88,9 +88,8 @@ class HyperspectralDataManagerConfig(DataManagerConfig):
     """How a scene of spectral images is read and sampled."""
 
     _target: Target = "unmix_plugin.datamanager:HyperspectralDataManager"
-    train_num_rays_per_batch: Ours[int] = 512
-    """Rays of the first training step; the model adapts the number to its budget of samples. Few: before anything is
-    known to be empty, a room has hundreds of samples a ray, and all of them are visible."""
+    train_num_rays_per_batch: Ours[int] = 2048
+    """Rays of the first training step; the model adapts the number to its budget of samples."""
     scene: SceneOptions = SceneOptions()
     """How the files are read and split."""
     subpixels: int | Auto = "auto"

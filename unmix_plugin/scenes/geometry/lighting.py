@@ -175,7 +175,7 @@ def _foretold_share(cameras: Cameras, places: Places, seen: Seen) -> float:
     turned = torch.stack([x, y, x * z, y * z, x * y], dim=-1)  # polynomials that change sign with x or y
     positions = cameras.camera_to_world[:, :, 3]
     centred = positions - positions.mean(dim=0)
-    # The views are cut into two halves, twice: along the two axes in which their positions vary most.
+    # The views are cut into two halves, twice (one view: once): along the two axes in which positions vary most.
     along = centred @ torch.linalg.svd(centred, full_matrices=False).Vh[:2].T
     return _least_share(seen, turned, (along > along.median(dim=0).values).T)
 
@@ -227,7 +227,7 @@ def _view_gains(seen: Seen) -> Float[Tensor, " N"]:
     return torch.where(known.any(dim=0), gains, torch.nan).float()
 
 
-def _least_share(values: Seen, functions: Float[Tensor, "P N F"], halves: Bool[Tensor, "2 N"]) -> float:
+def _least_share(values: Seen, functions: Float[Tensor, "P N F"], halves: Bool[Tensor, "D N"]) -> float:
     """Least share of the variance within places, seen by a half of the views, that a fit to the other predicts."""
     shares: list[float] = []
     for half in halves:
