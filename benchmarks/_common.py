@@ -167,16 +167,6 @@ def is_made(folder: Path) -> bool:
     return (folder / MADE).is_file()
 
 
-def scene_folder(name: str) -> Path:
-    """A path-traced scene of the cache. Raises SystemExit, with the command that makes it, if it is missing."""
-    folder = scenes_folder() / name
-    if not is_made(folder):
-        missing = f"the scene {name} has not been made (looked in {scenes_folder()})"
-        print(f"{missing}; make it with: python benchmarks/scenes.py --only {name}", file=sys.stderr)
-        raise SystemExit(2)
-    return folder
-
-
 def require_data(data: Path, what: str, remedy: str = "") -> None:
     """End with status 2 where the data of a benchmark are missing, and say which command makes them.
 
