@@ -2,6 +2,8 @@
 
 import io
 import math
+import subprocess
+import sys
 from collections.abc import Iterable
 from dataclasses import replace
 
@@ -22,7 +24,6 @@ from unmix_plugin.engine.training import optimizers as guards
 from unmix_plugin.engine.training.optimizers import (
     GradientGuard,
     ParameterAverage,
-    _learning_rate,
     build_optimizer,
     forget_gradients,
     set_learning_rates,
@@ -37,9 +38,14 @@ fractions = st.floats(0.0, 1.0)
 @given(st.floats(1e-5, 1.0), st.floats(1e-3, 1.0), fractions, fractions)
 def test_a_schedule_falls_by_equal_factors_from_lr_to_its_final_factor(lr, final_factor, a, b):
     config = OptimizerConfig(lr=lr, final_factor=final_factor)
-    assert math.isclose(_learning_rate(config, -a), config.lr, rel_tol=1e-12)
-    assert math.isclose(_learning_rate(config, 1.0 + a), config.lr * config.final_factor, rel_tol=1e-9)
-    ratio = _learning_rate(config, a) / _learning_rate(config, b)
+    optimizer = build_optimizer({"a": [nn.Parameter(torch.ones(1))]}, {"a": config})
+
+    def rate_at(progress: float) -> float:
+        return set_learning_rates(optimizer, {"a": config}, progress)["a"]
+
+    assert math.isclose(rate_at(-a), config.lr, rel_tol=1e-12)
+    assert math.isclose(rate_at(1.0 + a), config.lr * config.final_factor, rel_tol=1e-9)
+    ratio = rate_at(a) / rate_at(b)
     assert math.isclose(ratio, config.final_factor ** (a - b), rel_tol=1e-9)
 
 
@@ -55,6 +61,50 @@ def test_each_group_has_its_own_settings_and_rate():
     assert (found["a"]["weight_decay"], found["b"]["weight_decay"]) == (0.5, 0.0)
     with pytest.raises(ConfigError, match="group heads; configs: fields"):
         build_optimizer({"heads": [a]}, {"fields": OptimizerConfig()})
+    with pytest.raises(ConfigError, match="group b has a parameter that it or another group has already"):
+        build_optimizer({"a": [a], "b": [b, a]}, settings_)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.complex64])
+def test_steps_are_those_of_the_optimiser_of_pytorch(dtype):
+    generator = torch.Generator().manual_seed(0)
+    shapes, configs = ((3, 2), (4,)), {"a": OptimizerConfig(weight_decay=0.1), "b": OptimizerConfig(lr=0.3)}
+    ours = [nn.Parameter(torch.randn(shape, generator=generator, dtype=dtype)) for shape in shapes]
+    theirs = [nn.Parameter(param.detach().clone()) for param in ours]
+    optimizer = build_optimizer({"a": ours[:1], "b": ours[1:]}, configs)
+    groups = [
+        {"params": [param], "lr": config.lr, "weight_decay": config.weight_decay}
+        for param, config in zip(theirs, configs.values(), strict=True)
+    ]
+    is_fusable = dtype == torch.float32
+    reference = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15, fused=is_fusable)
+    for step in range(4):
+        for one, other in zip(ours, theirs, strict=True):
+            gradient = torch.randn(one.shape, generator=generator, dtype=dtype)
+            one.grad = other.grad = None if step == 2 and one.dim() == 1 else gradient
+        optimizer.step()
+        reference.step()
+        for one, other in zip(ours, theirs, strict=True):
+            assert torch.equal(one, other)
+            found, expected = optimizer.state[one], reference.state[other]
+            assert list(found) == list(expected)
+            assert all(torch.equal(found[name], expected[name]) for name in found)
+    optimizer.zero_grad()
+    assert [param.grad for param in ours] == [None, None]
+
+
+def test_a_step_imports_no_compiler():
+    code = (
+        "import sys, torch\n"
+        "from unmix_plugin.engine.configs import OptimizerConfig\n"
+        "from unmix_plugin.engine.training.optimizers import build_optimizer\n"
+        "param = torch.nn.Parameter(torch.ones(2))\n"
+        "param.grad = torch.ones(2)\n"
+        "build_optimizer({'a': [param]}, {'a': OptimizerConfig()}).step()\n"
+        "print(param.detach().tolist() != [1, 1], 'torch._dynamo' in sys.modules)"
+    )
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.split() == ["True", "False"]
 
 
 def test_a_group_whose_gradients_are_forgotten_steps_as_at_first():

@@ -1,3 +1,4 @@
+from importlib import resources
 from itertools import pairwise
 from pathlib import Path
 
@@ -43,6 +44,16 @@ def test_xyz_has_the_published_chromaticities():
     for nm, expected in locus.items():
         narrow = xyz[EVERY_NM.nearest(nm)]
         assert_close(narrow[:2] / narrow.sum(), torch.tensor(expected).double(), atol=1e-3, rtol=0)
+
+
+def test_the_shipped_observer_is_that_of_colour_science():
+    with np.printoptions():
+        from colour.colorimetry import MSDS_CMFS
+
+    table = resources.files("unmix_plugin.spectral.colour") / "cie_1931_2_degree.csv"
+    found = np.loadtxt(table.read_text(encoding="utf-8").splitlines(), delimiter=",", skiprows=1)
+    observer = MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
+    assert np.array_equal(found, np.column_stack([observer.wavelengths, observer.values]))
 
 
 def test_linear_rgb_is_the_published_srgb_matrix_up_to_the_white_of_each_channel():

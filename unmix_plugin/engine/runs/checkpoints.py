@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import safetensors.torch
-import torch
 from safetensors import SafetensorError
 from torch import Tensor, nn
 
@@ -36,7 +35,7 @@ from unmix_plugin.engine.runs.replacing import (
     remove_stale_temporaries,
 )
 from unmix_plugin.engine.runs.run_folder import checkpoint_steps
-from unmix_plugin.engine.training.optimizers import ParameterAverage
+from unmix_plugin.engine.training.optimizers import Adam, ParameterAverage
 from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.limits import read_bounded
 
@@ -252,9 +251,7 @@ class TrainingRecord:
             raise RunError(f"the checkpoint is damaged: {error}") from error
 
 
-def collect_tensors(
-    model: nn.Module, optimizer: torch.optim.Optimizer, average: ParameterAverage | None
-) -> dict[str, Tensor]:
+def collect_tensors(model: nn.Module, optimizer: Adam, average: ParameterAverage | None) -> dict[str, Tensor]:
     """The tensors of a checkpoint by name; they share memory with what is trained."""
     names = {id(param): name for name, param in model.named_parameters()}
     tensors = {MODEL + name: value for name, value in model.state_dict().items()}
@@ -266,9 +263,7 @@ def collect_tensors(
     return tensors
 
 
-def restore_training(
-    tensors: Mapping[str, Tensor], model: nn.Module, optimizer: torch.optim.Optimizer
-) -> None:
+def restore_training(tensors: Mapping[str, Tensor], model: nn.Module, optimizer: Adam) -> None:
     """Restore what `collect_tensors` gave, but for the average. Raises RunError: the tensors do not fit the model."""
     restore_model(tensors, model, averaged=False)
     params = dict(model.named_parameters())

@@ -4,11 +4,14 @@ A schedule is a pure function of the training progress in [0, 1], so it stretche
 seconds, a run has.
 """
 
+from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
+from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.optim.adam import adam
 
 from unmix_plugin.engine.configs import OptimizerConfig
 from unmix_plugin.errors import ConfigError, RunError
@@ -17,45 +20,101 @@ _BETAS = (0.9, 0.99)
 _EPS = 1e-15  # far below any gradient, so that the size of the loss does not matter
 
 
-def _learning_rate(config: OptimizerConfig, progress: float) -> float:
-    """Step size at `progress` in [0, 1]; beyond, that of the nearer end.
+class Adam:
+    """`torch.optim.Adam` by PyTorch's own function, without what the class does for compiled models: at its first use
+    that one imports TorchDynamo, for two seconds of every training.
 
-    >>> _learning_rate(OptimizerConfig(lr=1.0, final_factor=0.01), 0.5)
-    0.1
+    Source: Kingma and Ba 2015, Adam: A Method for Stochastic Optimization.
     """
-    return config.lr * config.final_factor ** min(max(progress, 0.0), 1.0)
+
+    def __init__(self, param_groups: list[dict[str, Any]]) -> None:
+        """
+        Args:
+            param_groups: Each with its `name`, `params`, `lr` and `weight_decay`.
+        """
+        self.param_groups = param_groups
+        self.state: defaultdict[Tensor, dict[str, Tensor]] = defaultdict(dict)
+        """Of each parameter that was stepped: `step`, `exp_avg` and `exp_avg_sq`."""
+        every = [param for group in param_groups for param in group["params"]]
+        self._is_fused = all(x.is_floating_point() and x.device.type in ("cpu", "cuda") for x in every)
+
+    def zero_grad(self) -> None:
+        """Forget all gradients."""
+        for group in self.param_groups:
+            for param in group["params"]:
+                param.grad = None
+
+    @torch.no_grad()
+    def step(self) -> None:
+        """Update the parameters that have gradients."""
+        for group in self.param_groups:
+            params = [param for param in group["params"] if param.grad is not None]
+            for param in params:
+                if not self.state[param]:
+                    device = param.device if self._is_fused else "cpu"
+                    self.state[param]["step"] = torch.zeros((), dtype=torch.float32, device=device)
+                    self.state[param]["exp_avg"] = torch.zeros_like(param)
+                    self.state[param]["exp_avg_sq"] = torch.zeros_like(param)
+            first, second = _BETAS
+            adam(
+                params,
+                [param.grad for param in params],
+                [self.state[param]["exp_avg"] for param in params],
+                [self.state[param]["exp_avg_sq"] for param in params],
+                [],
+                [self.state[param]["step"] for param in params],
+                fused=self._is_fused,
+                has_complex=any(map(torch.is_complex, params)),
+                amsgrad=False,
+                beta1=first,
+                beta2=second,
+                lr=group["lr"],
+                weight_decay=group["weight_decay"],
+                eps=_EPS,
+                maximize=False,
+            )
 
 
 def build_optimizer(
     param_groups: Mapping[str, list[nn.Parameter]], configs: Mapping[str, OptimizerConfig]
-) -> torch.optim.Adam:
+) -> Adam:
     """One Adam over all groups, each with its config's settings; `param_groups[i]["name"]` is the group's name. Raises
-    ConfigError: a group of the model has no optimizer config."""
+    ConfigError: a group of the model has no optimizer config, or a parameter that is in another place, too."""
     missing = sorted(name for name, params in param_groups.items() if params and name not in configs)
     if missing:
         raise ConfigError(
             f"no optimizer config for the parameter group {', '.join(missing)}; configs: {', '.join(sorted(configs))}"
         )
+    seen: set[int] = set()
+    for name, params in param_groups.items():
+        if len({*map(id, params)} - seen) < len(params):
+            raise ConfigError(
+                f"the parameter group {name} has a parameter that it or another group has already; list it once"
+            )
+        seen.update(map(id, params))
     groups = [
         {"name": name, "params": found, "lr": configs[name].lr, "weight_decay": configs[name].weight_decay}
         for name, found in param_groups.items()
         if found
     ]
-    params = [param for found in param_groups.values() for param in found]
-    is_fusable = all(param.is_floating_point() and param.device.type in ("cpu", "cuda") for param in params)
-    return torch.optim.Adam(groups, betas=_BETAS, eps=_EPS, fused=is_fusable)
+    return Adam(groups)
 
 
 def set_learning_rates(
-    optimizer: torch.optim.Optimizer, configs: Mapping[str, OptimizerConfig], progress: float
+    optimizer: Adam, configs: Mapping[str, OptimizerConfig], progress: float
 ) -> dict[str, float]:
-    """Set every group's step size for `progress`; returns them by group name."""
+    """Set every group's step size for `progress`, that of the nearer end outside [0, 1]; returns them by group name.
+
+    Between both ends they fall by equal factors.
+    """
+    within = min(max(progress, 0.0), 1.0)
     for group in optimizer.param_groups:
-        group["lr"] = _learning_rate(configs[group["name"]], progress)
+        config = configs[group["name"]]
+        group["lr"] = config.lr * config.final_factor**within
     return {group["name"]: group["lr"] for group in optimizer.param_groups}
 
 
-def forget_gradients(optimizer: torch.optim.Optimizer, names: Collection[str]) -> None:
+def forget_gradients(optimizer: Adam, names: Collection[str]) -> None:
     """Let some groups step as if no gradient had been seen before."""
     for group in optimizer.param_groups:
         if group["name"] in names:
@@ -70,7 +129,7 @@ _MAX_IN_A_ROW = 20
 class GradientGuard:
     """Looks at loss and gradients before each update and refuses non-finite ones."""
 
-    def __init__(self, optimizer: torch.optim.Optimizer) -> None:
+    def __init__(self, optimizer: Adam) -> None:
         self.optimizer = optimizer
         self.skipped = 0
         """Steps refused so far."""
@@ -85,7 +144,11 @@ class GradientGuard:
             group["name"]: [param.grad for param in group["params"] if param.grad is not None]
             for group in self.optimizer.param_groups
         }
-        norms = {name: _norm(values) for name, values in gradients.items() if values}
+        norms = {
+            name: torch.stack([torch.linalg.vector_norm(value) for value in values]).norm().float()
+            for name, values in gradients.items()
+            if values
+        }
         # One transfer for all of them: each would wait for the GPU.
         numbers = torch.stack([loss.detach().float(), *norms.values()])
         finite, value = torch.stack([torch.isfinite(numbers).all().float(), numbers[0]]).tolist()
@@ -99,10 +162,6 @@ class GradientGuard:
                 "or look for values far outside [0, 1] in the scene"
             )
         return bool(finite), value
-
-
-def _norm(gradients: list[Tensor]) -> Tensor:
-    return torch.stack([torch.linalg.vector_norm(gradient) for gradient in gradients]).norm().float()
 
 
 AVERAGE_INTERVAL = 8

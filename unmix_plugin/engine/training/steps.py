@@ -151,7 +151,7 @@ class TrainingSteps:
         outputs, losses, metrics = pipeline.get_train_loss_dict(step)
         _require_losses(losses, type(pipeline.model))
         total = torch.stack([loss.reshape(()) for loss in losses.values()]).sum()
-        self.optimizer.zero_grad(set_to_none=True)
+        self.optimizer.zero_grad()
         total.backward()
         wanted = pipeline.model.next_num_rays(outputs, num_rays)
         total, wanted = self._averaged(total, wanted)

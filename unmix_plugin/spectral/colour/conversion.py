@@ -20,6 +20,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Sequence
 from functools import lru_cache
+from importlib import resources
 from pathlib import Path
 from typing import Literal
 
@@ -229,7 +230,7 @@ def xyz_matrix(bands: Bands, dtype: torch.dtype = torch.float32) -> Float[Tensor
     """Matrix from spectra to CIE 1931 2 degree XYZ, on the CPU; flat 1 has Y = 1 and the chromaticity of illuminant E.
 
     Relative to the covered range: a sensor that ends at 650 nm is normalised by what it sees of Y. The colour matching
-    functions are those of CIE 15:2018 at 1 nm, as colour-science gives them; some band has to reach into 360-830 nm.
+    functions are those of CIE 15:2018 at 1 nm (cie_1931_2_degree.csv); some band has to reach into 360-830 nm.
     """
     return torch.tensor(_xyz_weights(bands), dtype=dtype)
 
@@ -274,12 +275,11 @@ def srgb_to_linear(srgb: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
 @lru_cache(maxsize=1)
 def _cumulative_cmfs() -> tuple[Float64[np.ndarray, " edges"], Float64[np.ndarray, "edges 3"]]:
     """Wavelengths in nm, and the integrals of the colour matching functions from 360 nm up to them."""
-    # Imported here because colour-science takes more than a second, and guarded because it changes how NumPy prints.
-    with np.printoptions():
-        from colour.colorimetry import MSDS_CMFS
-
-    observer = MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
-    wavelengths, values = np.asarray(observer.wavelengths), np.asarray(observer.values)
+    with (resources.files("unmix_plugin.spectral.colour") / "cie_1931_2_degree.csv").open(
+        encoding="utf-8"
+    ) as file:
+        wavelengths, *columns = np.loadtxt(file, delimiter=",", skiprows=1, unpack=True)
+    values = np.stack(columns, axis=1)
     steps = np.diff(wavelengths)[:, None] * (values[1:] + values[:-1]) / 2
     return wavelengths, np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
 
