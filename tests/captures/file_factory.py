@@ -14,15 +14,31 @@ import scipy.io
 from PIL import Image
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
+from unmix_plugin.captures.cube import BandTable, Cube, Exposure, Factor
 from unmix_plugin.captures.numbers import Held, Numbers
-from unmix_plugin.captures.spectral_file import BandTable, SpectralFile
 
 
-def file_of(values: np.ndarray, wavelengths_nm: np.ndarray | None = None, **facts: Any) -> SpectralFile:
-    """A file with these numbers (H, W, B); more facts by the names of `SpectralFile`'s fields."""
+def exposure_of_file(
+    time: float | list[float] | None = None,
+    gain: float | list[float] | None = None,
+    f_number: float | None = None,
+    source: str = "",
+    assumed: str = "",
+) -> Exposure:
+    """An exposure with these factors; where its time is stated, and the unit that is assumed."""
+    stated = [None if each is None else tuple(np.atleast_1d(each).tolist()) for each in (time, gain)]
+    return Exposure(
+        None if stated[0] is None else Factor(stated[0], source, assumed),
+        None if stated[1] is None else Factor(stated[1]),
+        f_number,
+    )
+
+
+def file_of(values: np.ndarray, wavelengths_nm: np.ndarray | None = None, **facts: Any) -> Cube:
+    """A file with these numbers (H, W, B); more facts by the names of `Cube`'s fields."""
     table = BandTable(wavelengths_nm)
     height, width, bands = values.shape
-    return SpectralFile(
+    return Cube(
         Path("memory.npy"),
         "npy",
         (height, width, bands),
@@ -119,11 +135,11 @@ def header_text(cube: np.ndarray, interleave: str, change: Mapping[str, Any]) ->
     return "ENVI\n" + "".join(f"{key} = {value}\n" for key, value in entries.items() if value is not None)
 
 
-def check_file(file: SpectralFile, **expected: Any) -> None:
+def check_file(file: Cube, **expected: Any) -> None:
     """That a file is and says what is expected; texts (`evidence`, `warning`, `note`) may be parts of what it says.
 
     `values` are its numbers, `calibrated` those after its gains and offsets; other names are its fields, those of its
-    bands, or entries of its metadata.
+    bands, or what else it says.
     """
     bands = file.bands
     for name, value in expected.items():
@@ -149,12 +165,12 @@ def check_file(file: SpectralFile, **expected: Any) -> None:
             case "names":
                 assert bands.names == tuple(value)
             case _:
-                facts = {"scale": file.linear and file.linear.scale, **file.metadata}
+                facts = {"scale": file.linear and file.linear.scale, **file.facts}
                 found = getattr(file, name) if hasattr(file, name) else facts.get(name)
                 assert found == (pytest.approx(value) if isinstance(value, float) else value), name
 
 
-def rows_and_bands_of(file: SpectralFile, values: np.ndarray) -> None:
+def rows_and_bands_of(file: Cube, values: np.ndarray) -> None:
     """That a file gives all its numbers, and any rows and bands of them."""
     rows, last = values.shape[0], values.shape[2] - 1
     assert (file.shape, file.dtype.newbyteorder("=")) == (values.shape, values.dtype.newbyteorder("="))

@@ -1,6 +1,7 @@
 """Tags of cameras, and each camera's formula against pixels computed one by one in plain arithmetic."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,8 +14,8 @@ from unmix_plugin.captures.camera_tags import (
     radiometric_model,
     tag_numbers,
 )
+from unmix_plugin.captures.cube import CameraTags, Cube
 from unmix_plugin.captures.readers.opening import open_spectral_file
-from unmix_plugin.captures.spectral_file import SpectralFile
 from unmix_plugin.errors import CaptureError
 
 
@@ -66,8 +67,8 @@ def test_a_band_has_its_centre_and_width_or_none_is_made_up(tags, centre, width)
 def test_numbers_of_10_bits_of_a_sequoia_are_as_bright_as_those_of_16():
     """Whose black level is 2046 in both."""
     numbers = np.random.default_rng(1).integers(40, 1000, (*SIZE, 1)).astype(np.uint16)
-    said = [{"xmp": SEQUOIA, "exif": EXIF | {"BitsPerSample": bits}} for bits in (10, 16)]
-    short, whole = (radiance_of(file_of(numbers * 64**i, metadata=own)) for i, own in enumerate(said))
+    said = [CameraTags(SEQUOIA, EXIF | {"BitsPerSample": bits}) for bits in (10, 16)]
+    short, whole = (radiance_of(file_of(numbers * 64**i, camera=own)) for i, own in enumerate(said))
     np.testing.assert_allclose(short, whole, rtol=1e-5)
     assert whole.mean() > 0
 
@@ -76,7 +77,7 @@ def test_exif_rationals_become_numbers(tmp_path):
     exif = {"ExposureTime": 0.0004725, "FNumber": 2.8, "ISOSpeed": 400, "FocalPlaneXResolution": 266.667}
     levels = [4800, 4801, 4802, 4803]
     path = write_band_file(tmp_path / "a.tif", np.zeros((2, 3)), {}, exif, black_level=levels)
-    found = open_spectral_file(path).metadata["exif"]
+    found = open_spectral_file(path).camera.exif
     assert {name: found[name] for name in exif} == pytest.approx(exif, rel=1e-6)
     assert found["BlackLevel"] == [4800.0, 4801.0, 4802.0, 4803.0]
     assert found["BitsPerSample"] == 16
@@ -117,15 +118,15 @@ def pixels():
     return np.random.default_rng(1).integers(6000, 60000, SIZE)
 
 
-def make(tmp_path, pixels, tags, exif=EXIF, **options) -> SpectralFile:
+def make(tmp_path, pixels, tags, exif=EXIF, **options) -> Cube:
     return open_spectral_file(write_band_file(tmp_path / "band.tif", pixels, tags, exif, **options))
 
 
-def radiance_of(file: SpectralFile, rows: slice = slice(None)) -> np.ndarray:
+def radiance_of(file: Cube, rows: slice = slice(None)) -> np.ndarray:
     return model_of(file).apply(file.read(rows).astype(np.float64), rows)
 
 
-def model_of(file: SpectralFile) -> _RadiometricModel:
+def model_of(file: Cube) -> _RadiometricModel:
     return present(radiometric_model(file))
 
 
@@ -191,7 +192,7 @@ def test_what_is_below_the_black_level_stays_below_0(tmp_path):
 def test_the_faulty_exposure_of_old_firmware_is_mended(tmp_path, pixels):
     file = make(tmp_path, pixels, MICASENSE, EXIF | {"ExposureTime": 1.0 / 6329.0})
     plain = radiance_of(file, slice(1))
-    file.metadata["exif"]["Model"] = "RedEdge"
+    file = replace(file, camera=CameraTags(file.camera.xmp, {**file.camera.exif, "Model": "RedEdge"}))
     np.testing.assert_allclose(radiance_of(file, slice(1)) / plain, (1.0 / 6329.0) / 0.000274, rtol=1e-4)
 
 
@@ -212,7 +213,7 @@ def test_the_faulty_exposure_of_old_firmware_is_mended(tmp_path, pixels):
 )
 def test_a_calibration_that_lacks_a_number_is_refused(tmp_path, pixels, tags, exif, message):
     file = make(tmp_path, pixels, tags)
-    file.metadata["exif"] = exif
+    file = replace(file, camera=CameraTags(file.camera.xmp, exif))
     with pytest.raises(CaptureError, match=message) as refusal:
         radiometric_model(file)
     assert "band.tif" in str(refusal.value)

@@ -11,10 +11,10 @@ from PIL import Image
 from tests.captures.capture_factory import HEIGHT, WIDTH, make_capture, process
 from tests.captures.file_factory import file_of
 from unmix_plugin.captures.calibration.calibration import Calibration, Raster
+from unmix_plugin.captures.cube import CaptureView
 from unmix_plugin.captures.plan import _background_rule as background_rule
 from unmix_plugin.captures.plan import _choose_mask as choose_mask
 from unmix_plugin.captures.readers.opening import open_spectral_file
-from unmix_plugin.captures.spectral_file import CaptureView
 from unmix_plugin.captures.writing.view_files import UNLABELLED, ViewRecipe, alpha_picture, write_view
 from unmix_plugin.captures.writing.view_files import _clean as clean
 from unmix_plugin.captures.writing.view_files import _read_labels as read_labels

@@ -13,12 +13,12 @@ from tests.captures.poses.alignment import SIMILARITY, elsewhere, in_a_row
 from tests.captures.poses.pose_factory import ring_set, transforms, write_json
 from tests.scenes.geometry.ground_views import flight_poses
 from tests.scenes.scene_factory import make_scene, ring_poses
+from unmix_plugin.captures.cube import CameraTags, CaptureView, Cube
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.captures.posing import _complete_rigs, _place_poses, pose_views
 from unmix_plugin.captures.process import _refuse_late
-from unmix_plugin.captures.spectral_file import CaptureView, SpectralFile
 from unmix_plugin.captures.writing.scene_files import _write_points
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.scenes.reading.loader import load_scene
@@ -106,8 +106,8 @@ FLIP = np.diag([1.0, -1.0, -1.0])
 ANGLES = {"a": "0,0,0", "b": "2,-3,1.5", "c": "-1,0.5,4"}
 
 
-def cube_of(height: int, width: int, **metadata) -> SpectralFile:
-    return file_of(np.broadcast_to(np.uint16(0), (height, width, 1)), metadata=metadata)
+def cube_of(height: int, width: int, **xmp: str) -> Cube:
+    return file_of(np.broadcast_to(np.uint16(0), (height, width, 1)), camera=CameraTags(xmp))
 
 
 SCALED = "lenses given for 640 x 480 pixels were scaled to {} x {}"
@@ -126,7 +126,7 @@ def test_lenses_that_were_scaled_to_their_pictures_are_said(width, height, note,
 
 
 def rig_view(release: str, sensor: str, angles: str | None = None) -> CaptureView:
-    cube = cube_of(3, 4, xmp={} if angles is None else {"Camera:RigRelatives": angles})
+    cube = cube_of(3, 4, **({} if angles is None else {"Camera:RigRelatives": angles}))
     return CaptureView(f"{release}{sensor}", cube, sensor, lens=SMALL_LENS, release=release)
 
 

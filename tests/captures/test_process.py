@@ -24,8 +24,8 @@ from tests.captures.capture_factory import (
 )
 from tests.captures.file_factory import present
 from unmix_plugin.captures import process as process_module
+from unmix_plugin.captures.cube import ReadOptions
 from unmix_plugin.captures.layouts.cubes import find_cubes
-from unmix_plugin.captures.spectral_file import ReadOptions
 from unmix_plugin.captures.wavelengths import parse_wavelengths
 from unmix_plugin.captures.writing.view_files import FULL_SCALE, write_view
 from unmix_plugin.engine.runs.replacing import LIST_NAME

@@ -162,7 +162,7 @@ def test_the_place_on_the_earth_is_kept_and_a_repeated_wavelength_left_out(cube,
     ended = done(image, tmp_path / "field.hdr", *words)
     assert "1 band left out: marked as bad in the file, of a wavelength that is there twice" in ended.out
     for name in ("abundances", "confidence", "mnf"):
-        assert open_spectral_file(tmp_path / "out" / "field" / f"{name}.hdr").metadata["map"] == on_map
+        assert open_spectral_file(tmp_path / "out" / "field" / f"{name}.hdr").map_entries == on_map
 
 
 def test_a_picture_is_unmixed_in_linear_light(tmp_path):

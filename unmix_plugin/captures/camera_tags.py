@@ -23,15 +23,13 @@ from xml.etree import ElementTree
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int
 
-from unmix_plugin.captures.spectral_file import BandTable, SpectralFile
+from unmix_plugin.captures.cube import BandTable, CameraTags, Cube, XmpTags
 from unmix_plugin.captures.wavelengths import PLUS_MINUS
 from unmix_plugin.errors import CaptureError, counted
 from unmix_plugin.limits import DEEPEST
 
 FactorOf: TypeAlias = Callable[[Int[np.ndarray, "h 1"], Int[np.ndarray, "1 W"]], Float64[np.ndarray, "h W"]]
 """Factor at rows y and columns x."""
-XmpTags: TypeAlias = dict[str, str | list[str]]
-"""Text of each tag, or the texts of a list."""
 _RDF = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}"
 _EXIF_CODE, _BLACK_LEVEL_CODE, _XMP_CODE = 34665, 50714, 700
 _EXIF_OF_PAGE = ("Make", "Model", "Software", "Orientation", "BitsPerSample", "BlackLevel", "DateTime")
@@ -50,7 +48,7 @@ _LARGEST_PACKET = 1 << 20
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 
 
-def parse_xmp(packet: bytes | str) -> XmpTags:
+def parse_xmp(packet: bytes | str) -> dict[str, str | list[str]]:
     """Tags of an XMP packet, elements and attributes alike; empty if it is damaged, or declares entities."""
     text = packet.decode("utf-8", "replace") if isinstance(packet, bytes) else packet
     start, end = text.find("<rdf:RDF"), text.rfind("</rdf:RDF>")
@@ -61,7 +59,7 @@ def parse_xmp(packet: bytes | str) -> XmpTags:
         return {}
     body = text[start:end] + "</rdf:RDF>" + ("</x:xmpmeta>" if start == opening else "")
     prefixes: dict[str, str] = {}
-    tags: XmpTags = {}
+    tags: dict[str, str | list[str]] = {}
     level = 0
     try:
         for event, item in ElementTree.iterparse(
@@ -79,25 +77,25 @@ def parse_xmp(packet: bytes | str) -> XmpTags:
     return tags
 
 
-def _tags_of(description: ElementTree.Element, prefixes: dict[str, str]) -> XmpTags:
+def _tags_of(description: ElementTree.Element, prefixes: dict[str, str]) -> dict[str, str | list[str]]:
     def name_of(tag: str) -> str:
         space, _, local = tag.removeprefix("{").rpartition("}")
         return f"{prefixes.get(space, '')}:{local}"
 
-    tags: XmpTags = {name_of(key): value.strip() for key, value in description.attrib.items()}
+    tags: dict[str, str | list[str]] = {
+        name_of(key): value.strip() for key, value in description.attrib.items()
+    }
     for child in description:
         items = [(item.text or "").strip() for item in child.iter(f"{_RDF}li")]
         tags[name_of(child.tag)] = items if items else (child.text or "").strip()
     return tags
 
 
-def camera_tags(page_tags: Any) -> dict[str, Any]:
-    """XMP and EXIF of a page, as JSON-able values.
+def camera_tags(page_tags: Any) -> CameraTags:
+    """XMP and EXIF of a page, rationals as floats.
 
     Args:
         page_tags: `tifffile.TiffTags` of a page.
-    Returns:
-        `xmp`, see `parse_xmp`, and `exif`: tags by tifffile's names, rationals as floats.
     """
     exif = {name: page_tags.valueof(name) for name in _EXIF_OF_PAGE}
     exif |= {name: _rational(page_tags.valueof(name)) for name in (*_EXPOSURE_OF_PAGE, *_FOCAL_PLANE_OF_PAGE)}
@@ -105,7 +103,7 @@ def camera_tags(page_tags: Any) -> dict[str, Any]:
     exif["BlackLevel"] = _black_levels(page_tags.get(_BLACK_LEVEL_CODE))
     known = {name: value for name, value in exif.items() if isinstance(value, (str, int, float, list))}
     plain = {name: int(value) if isinstance(value, int) else value for name, value in known.items()}
-    return {"xmp": parse_xmp(page_tags.valueof(_XMP_CODE) or b""), "exif": plain}
+    return CameraTags(parse_xmp(page_tags.valueof(_XMP_CODE) or b""), plain)
 
 
 def _rational(value: Any) -> Any:
@@ -219,10 +217,10 @@ class _RadiometricModel:
         return ((values - self.black_level) * factor[..., None]).astype(np.float32)
 
 
-def radiometric_model(file: SpectralFile) -> _RadiometricModel | None:
-    """The calibration that a file carries in `metadata["xmp"]` and `metadata["exif"]`; None where there is none. Raises
+def radiometric_model(file: Cube) -> _RadiometricModel | None:
+    """The calibration that a file carries in its camera's tags; None where there is none. Raises
     CaptureError: the file has a calibration that lacks a number, or one that can't be."""
-    tags, exif = file.metadata.get("xmp") or {}, file.metadata.get("exif") or {}
+    tags, exif = file.camera.xmp, file.camera.exif
     read = next((read for mark, read in _MAKERS.items() if tag_numbers(tags, mark) is not None), None)
     if read is None:
         return None
@@ -236,7 +234,7 @@ def radiometric_model(file: SpectralFile) -> _RadiometricModel | None:
     return model
 
 
-def _micasense(file: SpectralFile, tags: XmpTags, exif: Mapping[str, Any]) -> _RadiometricModel:
+def _micasense(file: Cube, tags: XmpTags, exif: Mapping[str, Any]) -> _RadiometricModel:
     """MicaSense RedEdge and Altum: radiance in W/m2/sr/nm.
 
         L = 1 / V * a1 / (gain * exposure) * (p - pBL) / 2^bits / (1 + a2 y / exposure - a3 y)
@@ -275,7 +273,7 @@ def _micasense(file: SpectralFile, tags: XmpTags, exif: Mapping[str, Any]) -> _R
     )
 
 
-def _sequoia(file: SpectralFile, tags: XmpTags, exif: Mapping[str, Any]) -> _RadiometricModel:
+def _sequoia(file: Cube, tags: XmpTags, exif: Mapping[str, Any]) -> _RadiometricModel:
     """Parrot Sequoia: radiance in a unit of its own, the same for its four bands.
 
         I = f^2 (p - B) / (A * exposure * iso + C) / V(x / W, y / H)
@@ -297,7 +295,7 @@ def _sequoia(file: SpectralFile, tags: XmpTags, exif: Mapping[str, Any]) -> _Rad
     )
 
 
-def _vignetting_2d(file: SpectralFile, tags: XmpTags) -> FactorOf:
+def _vignetting_2d(file: Cube, tags: XmpTags) -> FactorOf:
     """A polynomial in x / W and y / H, whose powers the file lists; 1 where there is none."""
     height, width = file.shape[:2]
     powers = [int(power) for power in tag_numbers(tags, "VignettingPolynomial2DName") or ()]
@@ -321,7 +319,7 @@ def _vignetting_2d(file: SpectralFile, tags: XmpTags) -> FactorOf:
     return vignetting
 
 
-def _dji(file: SpectralFile, tags: XmpTags, exif: Mapping[str, Any]) -> _RadiometricModel:
+def _dji(file: Cube, tags: XmpTags, exif: Mapping[str, Any]) -> _RadiometricModel:
     """DJI P4 Multispectral and Mavic 3 Multispectral: radiance in a unit of its own, the same for all bands.
 
         L = V(r) * (p - black level) / 2^bits / (gain * exposure) * gain adjustment
@@ -355,7 +353,7 @@ _MAKERS = {"RadiometricCalibration": _micasense, "SensorModel": _sequoia, "drone
 
 
 def _required(
-    file: SpectralFile, name: str, numbers: list[float] | None, count: int, positive: bool = False
+    file: Cube, name: str, numbers: list[float] | None, count: int, positive: bool = False
 ) -> list[float]:
     if numbers is None or len(numbers) != count or (positive and min(numbers) <= 0.0):
         kind = "positive number" if positive else "number"
@@ -367,12 +365,12 @@ def _required(
     return numbers
 
 
-def _xmp(file: SpectralFile, tags: XmpTags, count: int, *names: str, positive: bool = False) -> list[float]:
+def _xmp(file: Cube, tags: XmpTags, count: int, *names: str, positive: bool = False) -> list[float]:
     """The numbers of the first of some XMP tags that is there."""
     return _required(file, f"XMP {names[0]}", tag_numbers(tags, *names), count, positive)
 
 
-def _exif(file: SpectralFile, exif: Mapping[str, Any], *names: str) -> float:
+def _exif(file: Cube, exif: Mapping[str, Any], *names: str) -> float:
     """The first of some EXIF tags, a number above 0."""
     number = exif_number(exif, *names)
     return _required(file, f"EXIF {names[0]}", None if number is None else [number], 1, positive=True)[0]

@@ -2,7 +2,7 @@
 units.
 
 Every reader brings what a file says to *entries*: texts (of lists with commas), numbers or lists by name, in any case,
-with spaces or `_`. `state_bands`, `state_linear` and `exposure_facts` look them up by the tables here; `check_bands`
+with spaces or `_`. `state_bands`, `state_linear` and `state_exposure` look them up by the tables here; `check_bands`
 converts and checks. What is left out, and why, is appended to the reader's list of warnings.
 
 Specim writes `tint = 10.5` (milliseconds), others `integration time = 5 ms`, `exposure_us = 8000`, `Exposure Time (s)`.
@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from unmix_plugin.captures.spectral_file import BandTable, Linear, linear_values
+from unmix_plugin.captures.cube import BandTable, Exposure, Factor, Linear, Meaning, linear_values
 from unmix_plugin.captures.wavelengths import PLAUSIBLE_NM, wavelengths_in_names
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.spectral.bands import are_band_numbers, nm_per_unit
@@ -40,6 +40,15 @@ _DIVISOR = "reflectance_scale_factor"
 """Stored number of full reflectance, under the same name everywhere. Source: NV5, ENVI Header Files."""
 _CF_FACTOR = "scale_factor"
 """In this spelling always multiplies. Source: CF conventions, 8.1."""
+_MEANINGS = {
+    _DIVISOR: Meaning.REFLECTANCE,
+    "data_reflectance_gain_values": Meaning.REFLECTANCE,
+    "data_reflectance_offset_values": Meaning.REFLECTANCE,
+    "data_gain_values": Meaning.RADIANCE,
+    "data_offset_values": Meaning.RADIANCE,
+}
+"""What values are by the entries that lead to them, the first that is there. Source: NV5, ENVI Header Files, by which
+data gains make W/(m2 um sr)."""
 
 
 @dataclass(frozen=True)
@@ -229,14 +238,21 @@ def state_linear(
             gains = [1 / gains[0]]
         if len(gains) == 1 and not offsets and named.get("gain") == keys[0]:
             continue
-        stated = " and ".join(
-            f"'{key}'" for key, column in zip(keys, (gains, offsets), strict=True) if column
+        used = tuple(key for key, column in zip(keys, (gains, offsets), strict=True) if column)
+        linear = linear_values(
+            path,
+            num_bands,
+            gains=gains,
+            offsets=offsets,
+            source=f"{where} {' and '.join(map(repr, used))}",
+            meaning=_meaning_by(used),
+            entries=used,
         )
-        if linear := linear_values(path, num_bands, gains, offsets, f"{where} {stated}"):
+        if linear is not None:
             found.append(linear)
             has_gains |= bool(gains)
     if len(found) > 1:
-        warnings.append(f"{found[0].evidence} is applied, not {found[1].evidence}")
+        warnings.append(f"{found[0].source} is applied, not {found[1].source}")
     key = named.get(_DIVISOR, "")
     factors = _factors(path, key, entries.get(key, "1"))
     if set(factors) == {1.0}:
@@ -244,11 +260,24 @@ def state_linear(
     # An offset above 1 is one of stored numbers, not of reflectances, to which the factor leads.
     if has_gains or (found and np.abs(found[0].offsets).max() > 1):
         raise CaptureError(
-            f"{path}: has '{key}' {factors[0]:g} and other gains, or an offset above 1 ({found[0].evidence}); take one "
+            f"{path}: has '{key}' {factors[0]:g} and other gains, or an offset above 1 ({found[0].source}); take one "
             "out of the file, as it is unclear which the numbers need"
         )
-    offsets, said = (found[0].offsets.tolist(), f"{found[0].evidence} and") if found else ([], where)
-    return linear_values(path, num_bands, [1 / factor for factor in factors], offsets, f"{said} '{key}'")
+    return linear_values(
+        path,
+        num_bands,
+        gains=[1 / factor for factor in factors],
+        offsets=found[0].offsets.tolist() if found else [],
+        source=f"{f'{found[0].source} and' if found else where} '{key}'",
+        meaning=Meaning.REFLECTANCE,
+        entries=(*(found[0].entries if found else ()), key),
+    )
+
+
+def _meaning_by(entries: Sequence[str]) -> Meaning:
+    """What values are that entries of these names lead to."""
+    plain = {named_by(entry) for entry in entries}
+    return next((meaning for name, meaning in _MEANINGS.items() if name in plain), Meaning.FRACTION)
 
 
 def _floats(path: Path, what: str, value: Any) -> list[float]:
@@ -401,104 +430,139 @@ def _nm_per_stated(values: np.ndarray, used: np.ndarray, stated: StatedBands) ->
 
 # Exposure time and gain.
 
-_TIMES = {
-    "tint": 1e-3,
-    **dict.fromkeys(
-        ("integrationtime", "inttime", "exposure", "exposuretime", "shutter", "shuttertime"), 1e-3
-    ),
-    **dict.fromkeys(("exptime", "shutterspeed", "exifexposuretime"), 1.0),
-}
-"""Names of a time, and what a number without unit is in seconds: OpenEXR's expTime and EXIF's are in seconds."""
-_FACTS = {
-    **dict.fromkeys(_TIMES, "exposure_s"),
-    "gain": "gain",
-    "analoggain": "analog",
-    "analoguegain": "analog",
-    "digitalgain": "digital",
-    **dict.fromkeys(("exifisospeedratings", "exifisospeed"), "speed"),
-    "exiffnumber": "f_number",
-}
-"""What names say. A plain gain is the whole one; the others multiply each other."""
-_OF_EXIF = ("speed", "f_number")
-"""Facts that count beside a time of EXIF, and are left out where they make no sense."""
-_OWNERS = ("camera", "sensor", "detector", "imager")
-"""Words before a name that change nothing."""
+
+class _Exposed(Enum):
+    """Factors of an exposure."""
+
+    TIME = "the time, in seconds"
+    GAIN = "the whole gain"
+    ANALOG_GAIN = "a part of the gain, which multiplies the others"
+    DIGITAL_GAIN = "another part of the gain"
+    SPEED = "the gain as an ISO speed, of which 100 is 1"
+    F_NUMBER = "of the lens, the light over its square"
+
+    @property
+    def is_optional(self) -> bool:
+        """Whether EXIF alone has it: it counts beside a time of EXIF, and is left out where it makes no sense."""
+        return self in (_Exposed.SPEED, _Exposed.F_NUMBER)
+
+
 _SECONDS = {
     **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), 1.0),
     **dict.fromkeys(("ms", "msec", "msecs", "millisecond", "milliseconds"), 1e-3),
     **dict.fromkeys(("us", "µs", "μs", "usec", "usecs", "microsecond", "microseconds"), 1e-6),
     **dict.fromkeys(("ns", "nsec", "nanosecond", "nanoseconds"), 1e-9),
 }
+
+
+@dataclass(frozen=True)
+class _ExposureField:
+    """Entries that state one factor of an exposure."""
+
+    names: tuple[str, ...]
+    """Without spaces, in lower case, without what owns them (`camera`)."""
+    factor: _Exposed
+    assumed: str
+    """Unit of numbers without one; empty where the name fixes it."""
+    source: str
+    """Who says so."""
+
+    @property
+    def seconds(self) -> float:
+        """That a time without a unit is multiplied by."""
+        return _SECONDS[self.assumed or "seconds"]
+
+
+_EXPOSURE_FIELDS = (
+    _ExposureField(
+        ("tint", "integrationtime", "inttime", "exposure", "exposuretime", "shutter", "shuttertime"),
+        _Exposed.TIME,
+        "milliseconds",
+        "headers of Specim and Resonon",
+    ),
+    _ExposureField(("exptime", "shutterspeed"), _Exposed.TIME, "seconds", "OpenEXR, standard attributes"),
+    _ExposureField(("exifexposuretime",), _Exposed.TIME, "", "CIPA DC-008, tags of Exif"),
+    _ExposureField(("exifisospeedratings", "exifisospeed"), _Exposed.SPEED, "", "CIPA DC-008, tags of Exif"),
+    _ExposureField(("exiffnumber",), _Exposed.F_NUMBER, "", "CIPA DC-008, tags of Exif"),
+    _ExposureField(("gain",), _Exposed.GAIN, "a factor", "massipipe, of headers of Resonon"),
+    _ExposureField(
+        ("analoggain", "analoguegain"), _Exposed.ANALOG_GAIN, "a factor", "GenICam SFNC, Analog Control"
+    ),
+    _ExposureField(("digitalgain",), _Exposed.DIGITAL_GAIN, "a factor", "GenICam SFNC, Analog Control"),
+)
+_EXPOSURE_FIELD = {name: row for row in _EXPOSURE_FIELDS for name in row.names}
+_OWNERS = ("camera", "sensor", "detector", "imager")
+"""Words before a name that change nothing."""
 _LONGEST_VALUE = 64
 _MOST_DB = 200.0
 _VALUE = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)(?:/(\d+(?:\.\d*)?))?\s*([^\W\d]*)", re.I)
 """`20`, `20 ms`, `1/50 s`."""
 
 
-def exposure_facts(entries: Mapping[str, Any], where: str, warnings: list[str]) -> dict[str, Any]:
-    """What entries of a file say of its exposure: metadata `exposure_s`, `gain` and `f_number`, and `exposure_evidence`
-    and `gain_evidence`, as far as they are known.
+def state_exposure(entries: Mapping[str, Any], where: str, warnings: list[str]) -> Exposure:
+    """What entries of a file say of its exposure.
 
     Args:
         entries: Texts, numbers or lists (one number a band) by name; EXIF's begin with that word.
         where: What they are, for people: `header field`.
         warnings: What is not understood is appended.
 
-    >>> exposure_facts({"tint": "20"}, "header field", [])["exposure_s"]
+    >>> state_exposure({"tint": "20"}, "header field", []).time.number
     0.02
-    >>> exposure_facts({"Exposure Time (us)": "500"}, "header field", [])["exposure_s"]
+    >>> state_exposure({"Exposure Time (us)": "500"}, "header field", []).time.number
     0.0005
     """
-    found: dict[str, tuple[Any, str]] = {}
+    found: dict[_Exposed, Factor] = {}
     is_exif = False
-    named = {name: _split(name) for name in entries}
+    named = {key: _split(key) for key in entries}
     units = {name: str(entries[key]) for key, (name, unit) in named.items() if unit == "unit"}
     for key, (name, unit) in named.items():
-        what = _FACTS.get(name)
-        if what is None or unit == "unit":
+        row = _EXPOSURE_FIELD.get(name)
+        if row is None or unit == "unit":
             continue
         stated: Any = entries[key]  # one, or one a band
         if isinstance(stated, str):
             items = [item for item in re.split(r"[,;{}\[\]()]+", stated) if item.strip()]
         else:
             items = [str(item) for item in np.asarray(stated).reshape(-1).tolist()]
-        values = [_quantity(item, unit or units.get(name, ""), name) for item in items]
+        values = [_quantity(item, unit or units.get(name, ""), row) for item in items]
         known = [value for value in values if value is not None]
-        if what in _OF_EXIF and (len(values) != 1 or not known or not 0 < known[0][0] < np.inf):
+        if row.factor.is_optional and (len(values) != 1 or not known or not 0 < known[0][0] < np.inf):
             continue
         if not known or len(known) < len(values):
             said = f"{where} '{key}' is {', '.join(items)[:60]!r}, which is not understood"
             warnings.append(f"{said}: exposures may differ")
-        elif what not in found:
-            numbers = [number for number, _ in known]
-            has_unit = name.startswith("exif") or all(has_unit for _, has_unit in known)
-            taken = {1.0: "seconds", 1e-3: "milliseconds"}[_TIMES[name]] if name in _TIMES else "a factor"
-            evidence = f"{where} '{key}'" + ("" if has_unit else f", no unit: taken as {taken}")
-            found[what] = numbers[0] if len(set(numbers)) == 1 else numbers, evidence
+        elif row.factor not in found:
+            numbers = tuple(number for number, _ in known)
+            assumed = "" if all(has_unit for _, has_unit in known) else row.assumed
+            numbers = numbers[:1] if len(set(numbers)) == 1 else numbers
+            found[row.factor] = Factor(numbers, f"{where} '{key}'", assumed)
             is_exif |= name == "exifexposuretime"
-    return _combined({what: found[what] for what in found if is_exif or what not in _OF_EXIF}, warnings)
+    if not is_exif:
+        found = {factor: value for factor, value in found.items() if not factor.is_optional}
+    f_number = found.get(_Exposed.F_NUMBER)
+    gain = _whole_gain(found, warnings)
+    return Exposure(found.get(_Exposed.TIME), gain, None if f_number is None else f_number.numbers[0])
 
 
-def _combined(found: Mapping[str, tuple[Any, str]], warnings: list[str]) -> dict[str, Any]:
-    """Metadata of what was found, with one gain: EXIF's speed, the whole one, or the product of parts."""
-    facts: dict[str, Any] = {}
-    if "exposure_s" in found:
-        facts["exposure_s"], facts["exposure_evidence"] = found["exposure_s"]
-    facts |= {"f_number": found["f_number"][0]} if "f_number" in found else {}
-    parts = [name for name in ("speed", "gain") if name in found][:1]
-    if parts := parts or [name for name in ("analog", "digital") if name in found]:
-        numbers, evidence = zip(*(found[name] for name in parts), strict=True)
-        if len({np.size(number) for number in numbers} - {1}) > 1:
-            warnings.append(f"{' and '.join(evidence)} are lists of different lengths: exposures may differ")
-        else:
-            facts["gain"] = np.multiply.reduce(np.broadcast_arrays(*numbers)).tolist()
-            facts["gain_evidence"] = " and ".join(evidence)
-    return facts
+def _whole_gain(found: Mapping[_Exposed, Factor], warnings: list[str]) -> Factor | None:
+    """EXIF's speed, the whole gain, or the product of its parts."""
+    whole = found.get(_Exposed.SPEED, found.get(_Exposed.GAIN))
+    parts = [found[part] for part in (_Exposed.ANALOG_GAIN, _Exposed.DIGITAL_GAIN) if part in found]
+    if whole is not None or not parts:
+        return whole
+    sources = " and ".join(part.source for part in parts)
+    if len({len(part.numbers) for part in parts} - {1}) > 1:
+        warnings.append(f"{sources} are lists of different lengths: exposures may differ")
+        return None
+    product = np.multiply.reduce(np.broadcast_arrays(*(part.numbers for part in parts)))
+    assumed = next((part.assumed for part in parts if part.assumed), "")
+    return Factor(tuple(product.tolist()), sources, assumed)
 
 
 def is_exposure(name: str) -> bool:
     """Whether an entry of this name says something of the exposure."""
-    return _split(name)[0] in _FACTS
+    return _split(name)[0] in _EXPOSURE_FIELD
 
 
 def _split(key: str) -> tuple[str, str]:
@@ -516,20 +580,22 @@ def _split(key: str) -> tuple[str, str]:
     return "".join(words), unit
 
 
-def _quantity(text: str, unit: str, name: str) -> tuple[float, bool] | None:
-    """A time in seconds, a gain as a factor or an f-number, and whether a unit was there; None for anything else."""
+def _quantity(text: str, unit: str, row: _ExposureField) -> tuple[float, bool] | None:
+    """A time in seconds, a gain as a factor or an f-number, and whether a unit was there or none is needed; None for
+    anything else."""
     match = _VALUE.fullmatch(text.strip()) if len(text) <= _LONGEST_VALUE else None
     if match is None:
         return None
     number = float(match[1]) / float(match[2] or 1) if float(match[2] or 1) else np.nan
     unit = (match[3] or unit).strip().lower()
-    if name in _TIMES:
-        factor = _SECONDS.get(unit, None if unit else _TIMES[name])
-        return None if factor is None or not number > 0 else (float(f"{number * factor:.12g}"), bool(unit))
+    if row.factor is _Exposed.TIME:
+        factor = _SECONDS.get(unit, None if unit else row.seconds)
+        has_unit = bool(unit) or not row.assumed
+        return None if factor is None or not number > 0 else (float(f"{number * factor:.12g}"), has_unit)
     if unit == "db":
         return (10.0 ** (number / 20.0), True) if abs(number) <= _MOST_DB else None
     if unit or not number >= 0:
         return None
-    if _FACTS[name] in _OF_EXIF:
-        return (number / 100 if _FACTS[name] == "speed" else number), True
+    if row.factor.is_optional:
+        return (number / 100 if row.factor is _Exposed.SPEED else number), True
     return number or 1.0, False  # a gain of 0 without a unit can only be in decibels

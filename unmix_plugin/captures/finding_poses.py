@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from unmix_plugin.captures.calibration.calibration import Calibration
+from unmix_plugin.captures.cube import Capture, CaptureView
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.plan import Plan
 from unmix_plugin.captures.poses.estimation import contrast_picture, estimate_poses, require_pycolmap
@@ -33,7 +34,6 @@ from unmix_plugin.captures.poses.pose_set import PoseSet
 from unmix_plugin.captures.poses.turntable import poses_from_turntable
 from unmix_plugin.captures.poses.turntable_evidence import parse_angles
 from unmix_plugin.captures.posing import ESTIMATE, FROM_PICTURES, MARKERS, TURNTABLE, lens_of_view
-from unmix_plugin.captures.spectral_file import Capture, CaptureView
 from unmix_plugin.captures.writing.view_files import FULL_SCALE, ViewRecord
 from unmix_plugin.errors import CaptureError, ConfigError
 from unmix_plugin.scenes.reading.cubes import map_array

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from unmix_plugin.captures.spectral_file import Axes, Capture, ReadOptions
+from unmix_plugin.captures.cube import Axes, Capture, ReadOptions
 from unmix_plugin.errors import CaptureError
 
 _LAYOUTS = {

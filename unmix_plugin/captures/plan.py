@@ -14,7 +14,6 @@ from jaxtyping import Float32
 
 from unmix_plugin import __version__
 from unmix_plugin.captures.calibration.exposures import ExposedFiles, compare_exposures, exposure_of
-from unmix_plugin.captures.calibration.references import is_srgb
 from unmix_plugin.captures.calibration.sensor import (
     BRIGHT_PERCENTILE,
     Sensor,
@@ -23,10 +22,10 @@ from unmix_plugin.captures.calibration.sensor import (
     sampled_rows,
 )
 from unmix_plugin.captures.camera_tags import radiometric_model
+from unmix_plugin.captures.cube import Capture, CaptureView, Cube
 from unmix_plugin.captures.options import MaskKind, ProcessOptions, plain_options
 from unmix_plugin.captures.poses.pose_set import PosedCamera, reading
 from unmix_plugin.captures.report import Code, Kind, Remark, sentences
-from unmix_plugin.captures.spectral_file import Capture, CaptureView, SpectralFile
 from unmix_plugin.captures.writing.view_files import BackgroundRule, ViewRecipe, alpha_picture
 from unmix_plugin.engine.sampling import evenly_spaced
 from unmix_plugin.errors import CaptureError, ConfigError, name_some
@@ -107,7 +106,7 @@ def make_plan(
     capture: Capture,
     views: Sequence[CaptureView],
     options: ProcessOptions,
-    references: tuple[SpectralFile | None, SpectralFile | None],
+    references: tuple[Cube | None, Cube | None],
     cameras: Mapping[str, PosedCamera] | None = None,
 ) -> Plan:
     """Look at some rows of every view and decide.
@@ -200,7 +199,7 @@ def make_plan(
     )
 
 
-def _with_one_exposure(sensors: dict[str, Sensor], first: dict[str, SpectralFile]) -> dict[str, Sensor]:
+def _with_one_exposure(sensors: dict[str, Sensor], first: dict[str, Cube]) -> dict[str, Sensor]:
     """The sensors with those brought to one exposure that have no white reference: lenses of a rig, which are exposed
     each for its own band, or views of one camera in several sizes. The first one says what was done, or was not.
 
@@ -215,11 +214,14 @@ def _with_one_exposure(sensors: dict[str, Sensor], first: dict[str, SpectralFile
         for name in known or rest
         if radiometric_model(first[name]) is None
         # What is wrong with those of one sensor was said of it.
-        and (exposure_of(first[name]) is not None or "exposure_s" not in first[name].metadata)
+        and (exposure_of(first[name]) is not None or first[name].exposure.time is None)
     ]
     if len(bare) < 2 or not files:
         return sensors
-    is_bent, is_finished = any(map(is_srgb, files)), any(may_be_reflectance([file]) for file in files)
+    is_bent, is_finished = (
+        any(file.is_srgb for file in files),
+        any(may_be_reflectance([file]) for file in files),
+    )
     compared = compare_exposures(ExposedFiles(files, is_srgb=is_bent, may_be_reflectance=is_finished))
     common = compared.common
     remarks = [one for one in compared.remarks if one.code.looks_wrong or known or common is None]
@@ -242,7 +244,7 @@ def _doubts_of_meaning(
     if options.mask == "auto" and mask == "none" and not any(view.release for view in views):
         yield Remark.of(Code.NO_MASK_FOUND)
     kinds = {(one.is_absolute, one.is_stated): one.unit for one in sensors}
-    if len(kinds) > 1 and not any(is_srgb(view.cube) for view in views):
+    if len(kinds) > 1 and not any(view.cube.is_srgb for view in views):
         yield Remark.of(Code.UNLIKE_MEANINGS, kinds=[*kinds.values()])
 
 
@@ -412,7 +414,7 @@ def _files_of(paths: Iterable[Path]) -> Iterator[Path]:
         yield from sorted(child for child in path.iterdir() if child.is_file()) if path.is_dir() else [path]
 
 
-def _warnings_of_files(files: Sequence[tuple[str, SpectralFile | None]]) -> list[str]:
+def _warnings_of_files(files: Sequence[tuple[str, Cube | None]]) -> list[str]:
     """What files warn of; one sentence where several warn of the same."""
     found = [
         Remark.of(Code.FILE_WARNING, [name], text=text)
@@ -423,11 +425,11 @@ def _warnings_of_files(files: Sequence[tuple[str, SpectralFile | None]]) -> list
     return sentences(found, Kind.WRONG)
 
 
-def _notes_on_pictures(files: Sequence[SpectralFile]) -> list[str]:
+def _notes_on_pictures(files: Sequence[Cube]) -> list[str]:
     """Notes on encoding, order of colours and orientation, one sentence each; none where there is no picture."""
     pictures = [file for file in files if file.reader == "picture"]
     notes = []
-    if any(map(is_srgb, pictures)):
+    if any(file.is_srgb for file in pictures):
         notes.append("pictures are taken as sRGB and brought to linear light")
     for centres in (file.bands.wavelengths_nm for file in pictures):
         if centres is not None and len(centres) == 3 and centres[0] < centres[2]:
@@ -437,7 +439,7 @@ def _notes_on_pictures(files: Sequence[SpectralFile]) -> list[str]:
                 f"{green} nm for green, {blue} nm for blue. If this is wrong, give --wavelengths {blue},{green},{red}"
             )
             break
-    turned = sum(file.metadata.get("orientation", 1) != 1 for file in files)
+    turned = sum(file.orientation != 1 for file in files)
     if turned:
         notes.append(
             f"EXIF's orientation of {turned} of {len(files)} pictures is ignored, as poses and lenses refer to the "

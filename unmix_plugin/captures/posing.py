@@ -26,12 +26,12 @@ import numpy as np
 from jaxtyping import Float64
 
 from unmix_plugin.captures.camera_tags import tag_numbers
+from unmix_plugin.captures.cube import Capture, CaptureView
 from unmix_plugin.captures.names import match_poses
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera, PoseSet, where_rays_meet
 from unmix_plugin.captures.poses.reading import read_poses
-from unmix_plugin.captures.spectral_file import Capture, CaptureView
 from unmix_plugin.engine.geometry.camera_paths import focus_point, meeting_point
 from unmix_plugin.errors import CaptureError, ConfigError, counted, did_you_mean, name_some
 from unmix_plugin.scenes.placement import METRES_KEY, Placement
@@ -178,7 +178,7 @@ def lens_of_view(lens: Lens | None, view: CaptureView) -> Lens:
         raise CaptureError(
             f"view {view.name} has {width} x {height} pixels (width x height), its lens is given for {lens.width} x "
             f"{lens.height}; expected the same shape: give the poses of these images"
-            f"{turned if 'orientation' in view.cube.metadata else ''}"
+            f"{turned if view.cube.orientation != 1 else ''}"
         )
     return lens.seen_as(width, height, (0.0, 0.0), (across, down))
 
@@ -245,7 +245,7 @@ def _stated_offset(base: CaptureView, view: CaptureView) -> _Pose | None:
     """The same by the rotations of both lenses to the reference lens that their files say; None where one doesn't."""
     from scipy.spatial.transform import Rotation
 
-    angles = [tag_numbers(one.cube.metadata.get("xmp") or {}, "RigRelatives") for one in (base, view)]
+    angles = [tag_numbers(one.cube.camera.xmp, "RigRelatives") for one in (base, view)]
     if any(three is None or len(three) != 3 or not np.isfinite(three).all() for three in angles):
         return None
     first, second = (Rotation.from_euler("XYZ", three, degrees=True).as_matrix() for three in angles)

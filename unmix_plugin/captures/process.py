@@ -14,6 +14,12 @@ from typing import Any
 import numpy as np
 
 from unmix_plugin.captures.calibration.references import require_comparable
+from unmix_plugin.captures.cube import (
+    Capture,
+    CaptureView,
+    Cube,
+    ReadOptions,
+)
 from unmix_plugin.captures.decisions import decisions_of
 from unmix_plugin.captures.finding_poses import check_pose_options, marked_poses, poses_of_written_views
 from unmix_plugin.captures.match_checks import views_of_other_poses
@@ -34,12 +40,6 @@ from unmix_plugin.captures.posing import (
 )
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.report import Code, Remark
-from unmix_plugin.captures.spectral_file import (
-    Capture,
-    CaptureView,
-    ReadOptions,
-    SpectralFile,
-)
 from unmix_plugin.captures.spoilt import UnreadableViews, judge_sharpness
 from unmix_plugin.captures.wavelengths import parse_wavelengths
 from unmix_plugin.captures.writing.resampling import Resampling
@@ -254,14 +254,14 @@ def _check(options: ProcessOptions) -> None:
         raise ConfigError(f"--max-noise {options.max_noise:g}: expected a share above 0")
 
 
-def _open_capture(options: ProcessOptions, references: Sequence[SpectralFile | None]) -> Capture:
+def _open_capture(options: ProcessOptions, references: Sequence[Cube | None]) -> Capture:
     wavelengths = None if options.wavelengths is None else parse_wavelengths(options.wavelengths)
     named = tuple(path for file in references if file is not None for path in file.files)
     if options.poses is not None:  # an array, perhaps
         named += (Path(options.poses), options.data / options.poses)
     asked = ReadOptions(options.dataset, wavelengths, options.axes, exclude=named)
     capture = _by_size(find_views(options.layout, options.data, asked))
-    first: dict[str, SpectralFile] = {}
+    first: dict[str, Cube] = {}
     for view in capture.views:
         _refuse_unlike(view.cube, first.setdefault(view.sensor, view.cube))
     return capture
@@ -303,8 +303,8 @@ def _by_size(capture: Capture) -> Capture:
     return replace(capture, views=tuple(views), notes=(*capture.notes, note))
 
 
-def _open_references(options: ProcessOptions) -> tuple[SpectralFile | None, SpectralFile | None]:
-    opened: list[SpectralFile | None] = []
+def _open_references(options: ProcessOptions) -> tuple[Cube | None, Cube | None]:
+    opened: list[Cube | None] = []
     for path, flag in ((options.dark, "--dark"), (options.white, "--white")):
         if path is not None and not path.exists():
             raise CaptureError(f"{flag} {path}: no such file; give the image of the reference")
@@ -313,7 +313,7 @@ def _open_references(options: ProcessOptions) -> tuple[SpectralFile | None, Spec
     return opened[0], opened[1]
 
 
-def _refuse_unlike(cube: SpectralFile, first: SpectralFile) -> None:
+def _refuse_unlike(cube: Cube, first: Cube) -> None:
     """Views of one sensor have the same size, bands, unit and type of numbers."""
     if cube.shape != first.shape:
         found, expected = (" x ".join(map(str, file.shape)) for file in (cube, first))

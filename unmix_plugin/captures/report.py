@@ -118,7 +118,7 @@ class Code(Enum):
         "Give one number, or one a band, with points as decimal marks"
     )
     EXPOSURE_UNITS_MISSING = _wrong(
-        "{factor} have no unit in some files ({evidence}): values may be off by a factor"
+        "{factor} have no unit in some files ({sources}): values may be off by a factor"
     )
     EXPOSURE_OF_SOME_SENSORS = _wrong(
         "exposures of {lacking} are not known or not compared, those of {known} are: values of these lenses or "

@@ -24,8 +24,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Float64
 
+from unmix_plugin.captures.cube import CaptureView
 from unmix_plugin.captures.options import ProcessOptions
-from unmix_plugin.captures.spectral_file import CaptureView
 from unmix_plugin.captures.writing.view_files import FULL_SCALE, ViewRecord
 from unmix_plugin.errors import counted, name_some
 from unmix_plugin.scenes.reading.cubes import map_array

@@ -15,7 +15,7 @@ from unmix_plugin.errors import CaptureError, ConfigError, counted
 if TYPE_CHECKING:
     import numpy as np
 
-    from unmix_plugin.captures.spectral_file import SpectralFile
+    from unmix_plugin.captures.cube import Cube
     from unmix_plugin.spectral.features import NoiseFractions
     from unmix_plugin.spectral.library.material_library import MaterialLibrary
     from unmix_plugin.spectral.unmixing.image import UnmixedImage
@@ -82,7 +82,7 @@ def image(argv: list[str]) -> None:
     _say_what_was_read(opened, mask, len(bands), library is not None)
     fractions = _fractions(cube, mask, options.mnf)
     found = unmix_image(cube, options.endmembers, mask=mask, shares=options.shares, seed=options.seed)
-    place = opened.metadata.get("map")
+    place = dict(opened.map_entries) or None
     remove(*({*all_paths} - {*paths}))  # they would tell of other materials
     names = write_unmixed_image(folder, found, wavelengths, bands + 1, place, library, fractions)
     _say(found, mask, names)
@@ -90,20 +90,20 @@ def image(argv: list[str]) -> None:
         tell(f"  {path}")
 
 
-def _say_what_was_read(opened: SpectralFile, mask: np.ndarray, num_bands: int, is_compared: bool) -> None:
+def _say_what_was_read(opened: Cube, mask: np.ndarray, num_bands: int, is_compared: bool) -> None:
     """Size, doubts and notes of a file, and what of it is left out."""
-    from unmix_plugin.captures.calibration.references import is_srgb, stated_reflectance
+    from unmix_plugin.captures.calibration.references import stated_reflectance
     from unmix_plugin.trained.run_materials import LIGHT_UNKNOWN
 
     size = f"{mask.shape[0]} x {mask.shape[1]} pixels, {counted(num_bands, 'band')}"
     tell(f"{opened.path}: {size}")
     for warning in opened.warnings:
         tell(f"looks wrong: {warning}")
-    if "geo_reference" in opened.metadata:
+    if opened.is_geotiff:
         tell("note: the maps do not keep the geo-reference of a TIFF; their pixels are those of the file")
     for note in opened.notes:
         tell(f"note: {note}")
-    if is_srgb(opened):
+    if opened.is_srgb:
         tell("the picture is taken as sRGB and brought to linear light")
     if is_compared and stated_reflectance(opened) is None:
         tell(f"note: the file does not say that it holds reflectance. If it does not, {LIGHT_UNKNOWN}")
@@ -152,7 +152,7 @@ def _library(options: _ImageOptions, wavelengths: np.ndarray | None) -> Material
     return library_of(options.library, Bands.of(wavelengths))
 
 
-def _good_bands(opened: SpectralFile) -> tuple[np.ndarray, np.ndarray | None]:
+def _good_bands(opened: Cube) -> tuple[np.ndarray, np.ndarray | None]:
     """Indices of the bands that the file does not mark as bad, by wavelength where that is known, each wavelength once;
     and wavelengths."""
     import numpy as np

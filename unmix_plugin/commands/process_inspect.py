@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from unmix_plugin.captures.spectral_file import Axes, ReadOptions
+from unmix_plugin.captures.cube import Axes, ReadOptions
 from unmix_plugin.commands.entry import DONE, USER_ERROR
 from unmix_plugin.engine.printing import tell
 from unmix_plugin.errors import CaptureError, ConfigError, counted

@@ -15,8 +15,8 @@ from unmix_plugin.captures.calibration.calibration import Calibration, Raster
 from unmix_plugin.captures.calibration.references import _open_reference as open_reference
 from unmix_plugin.captures.calibration.references import _panel_reference as panel_reference
 from unmix_plugin.captures.calibration.references import find_missing, own_dark_mean
+from unmix_plugin.captures.cube import Cube, Linear
 from unmix_plugin.captures.poses.lens import Lens
-from unmix_plugin.captures.spectral_file import Linear, SpectralFile
 from unmix_plugin.errors import CaptureError, ConfigError
 
 LINES, SAMPLES, NUM = 40, 24, 3
@@ -25,7 +25,7 @@ ALL = slice(None)
 ALL_BANDS = np.arange(NUM)
 
 
-def reference(stored: np.ndarray, kind: str = "white reference", cube: SpectralFile | None = None, **facts):
+def reference(stored: np.ndarray, kind: str = "white reference", cube: Cube | None = None, **facts):
     """Of a file with these numbers, for a cube that is like it."""
     file = file_of(stored, **facts)
     return open_reference(file, kind, cube or file_of(stored))
@@ -206,7 +206,7 @@ def test_a_panel_is_the_mean_of_what_was_measured_in_its_rectangle(no_data: tupl
         ("leaf", np.uint16, {}, True),
         ("reflectance_target", np.uint16, {}, True),  # which is raw all the same
         ("REFLECTANCE_212", np.float32, {}, False),
-        ("leaf", np.uint16, {"metadata": {"header": {"reflectance scale factor": "1"}}}, False),
+        ("leaf", np.uint16, {"reflectance_source": "header field 'reflectance scale factor'"}, False),
     ],
 )
 def test_dark_lines_of_raw_numbers_are_a_dark_frame_whatever_they_are_called(name, dtype, facts, has_dark):

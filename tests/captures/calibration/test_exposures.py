@@ -16,11 +16,11 @@ from tests.captures.capture_factory import (
     write_cube,
     write_poses,
 )
-from tests.captures.file_factory import file_of, present
+from tests.captures.file_factory import exposure_of_file, file_of, present
 from unmix_plugin.captures.calibration.exposures import ExposedFiles, compare_exposures, exposure_of
-from unmix_plugin.captures.fields import exposure_facts
+from unmix_plugin.captures.cube import Exposure, Linear, Meaning
+from unmix_plugin.captures.fields import state_exposure
 from unmix_plugin.captures.report import Code, Kind, Remark, sentences
-from unmix_plugin.captures.spectral_file import Linear
 
 pytestmark = pytest.mark.usefixtures("no_contact_sheet")
 
@@ -45,7 +45,7 @@ pytestmark = pytest.mark.usefixtures("no_contact_sheet")
 )
 def test_times_by_any_name_in_any_unit(entries, seconds):
     warnings: list[str] = []
-    assert exposure_facts(entries, "header field", warnings)["exposure_s"] == pytest.approx(seconds)
+    assert state_exposure(entries, "header field", warnings).to_json()["exposure_s"] == pytest.approx(seconds)
     assert not warnings
 
 
@@ -54,7 +54,7 @@ def test_times_by_any_name_in_any_unit(entries, seconds):
 )
 def test_what_is_not_understood_is_said(name, text):
     warnings: list[str] = []
-    assert not exposure_facts({name: text}, "header field", warnings)
+    assert state_exposure({name: text}, "header field", warnings) == Exposure()
     assert f"header field '{name}' is '{text[:60]}', which is not understood" in warnings[0]
 
 
@@ -62,7 +62,7 @@ def test_what_is_not_understood_is_said(name, text):
 def test_a_faulty_tag_of_exif_leaves_the_others_of_an_exposure(faulty):
     def facts(time, speed, f_number):
         entries = {"EXIF ExposureTime": time, "EXIF ISOSpeedRatings": speed, "EXIF FNumber": f_number}
-        found = exposure_facts(entries, "tag", [])
+        found = state_exposure(entries, "tag", []).to_json()
         return [found.get(name) for name in ("exposure_s", "gain", "f_number")]
 
     assert facts(0.02, 200, faulty) == [0.02, 2.0, None]
@@ -88,14 +88,14 @@ def test_a_faulty_tag_of_exif_leaves_the_others_of_an_exposure(faulty):
 )
 def test_gains_of_parts_of_a_camera_multiply_each_other_and_a_plain_one_is_the_whole(entries, gain):
     warnings: list[str] = []
-    facts = exposure_facts(entries, "header field", warnings)
+    facts = state_exposure(entries, "header field", warnings).to_json()
     assert facts.get("gain") == (pytest.approx(gain, rel=1e-4) if gain else None)
     assert len(warnings) == (gain is None)
 
 
-def exposed(time, gain=1.0, evidence="header field 'tint', no unit: taken as milliseconds"):
-    facts = {"exposure_s": time, "gain": gain, "exposure_evidence": evidence}
-    return file_of(np.ones((2, 2, 3), np.uint16), metadata=facts)
+def exposed(time, gain=1.0, source="header field 'tint'", assumed="milliseconds"):
+    exposure = exposure_of_file(time, gain, source=source, assumed=assumed)
+    return file_of(np.ones((2, 2, 3), np.uint16), exposure=exposure)
 
 
 @dataclass(frozen=True)
@@ -147,14 +147,14 @@ def test_what_may_be_wrong_with_exposures_is_said():
     assert "1 view without exposure time" in warnings([*views, plain], [], [])
     assert "does not say how long" in warnings(views, [plain], [])
     assert "cameras bend the brightness" in warnings(views, [], [], is_bent=True)
-    other = exposed(0.005, evidence="header field 'exposure time'")
+    other = exposed(0.005, source="header field 'exposure time'", assumed="")
     assert "have no unit in some files" in warnings(views, [other], [])
     assert warnings([exposed(0.01), replace(exposed([0.01, 0.02]), shape=(2, 2, 2))]) == ""  # of two sizes
 
 
 def test_the_aperture_counts_for_light_and_not_for_dark_current():
     def taken(time, f_number):
-        return replace(exposed(time), metadata={"exposure_s": time, "f_number": f_number})
+        return replace(exposed(time), exposure=exposure_of_file(time, None, f_number))
 
     views = [taken(0.01, 4.0), taken(0.02, 4.0 * 2**0.5), taken(0.04, 8.0)]  # the same light
     found = compared(views)
@@ -189,8 +189,8 @@ def test_scenes_have_the_same_values_whatever_the_exposures(tmp_path):
 
 @pytest.mark.parametrize("stated", ["{10.5, 5.25}", "10,5"])
 def test_exposures_that_are_neither_one_nor_one_a_band_are_not_dropped_in_silence(stated):
-    facts = exposure_facts({"tint": stated}, "header field", [])
-    odd = file_of(np.ones((2, 2, 3), np.uint16), metadata=facts)
+    exposure = state_exposure({"tint": stated}, "header field", [])
+    odd = file_of(np.ones((2, 2, 3), np.uint16), exposure=exposure)
     other = exposed([0.02, 0.01])
     for views, whites in (([odd, other], []), ([odd], [exposed(0.01)]), ([exposed(0.01)], [odd])):
         found = compared(views, whites)
@@ -243,14 +243,14 @@ def test_values_are_finished_by_gains_or_names_that_say_so():
         assert "not divided by that" in notes(path=path, linear=linear)[0]
         assert "each is brought to" in notes(path=path)[0]  # raw, as whole numbers are
         assert "each is brought to" in notes([exposed(0.01)], path=path, dtype=values)[0]
-    for evidence in ("header field 'data gain values'", "GDAL's 'data_gain_values' and 'data_offset_values'"):
-        assert "not divided by that" in notes(linear=replace(linear, evidence=evidence))[0]
+    for meaning in (Meaning.RADIANCE, Meaning.REFLECTANCE):
+        assert "not divided by that" in notes(linear=replace(linear, meaning=meaning))[0]
     assert "each is brought to" in notes(linear=linear)[0]
     assert "each is brought to" in notes(path=Path("reflectances_of_lamps.npy"), dtype=values)[0]
 
 
-def stating(**facts):
-    return file_of(np.ones((2, 2, 3), np.uint16), metadata={"exposure_s": 0.01, **facts})
+def stating(time=0.01, **factors):
+    return file_of(np.ones((2, 2, 3), np.uint16), exposure=exposure_of_file(time, **factors))
 
 
 @pytest.mark.parametrize(
@@ -262,9 +262,9 @@ def stating(**facts):
         ([{"gain": [1.0, 2.0, 1.0]}, {}], [], Code.EXPOSURE_FACTOR_UNKNOWN, False),
         ([{"f_number": 4.0}], [{}], Code.EXPOSURE_FACTOR_UNKNOWN, False),
         ([{"gain": 1.0}], [{}], Code.GAIN_TAKEN_AS_ONE, True),
-        ([{}], [{"exposure_s": None}], Code.WHITE_EXPOSURE_UNKNOWN, True),
-        ([{"exposure_s": None}], [{}], Code.EXPOSURE_UNKNOWN, False),
-        ([{"exposure_s": None}, {}], [], Code.EXPOSURE_UNKNOWN, False),
+        ([{}], [{"time": None}], Code.WHITE_EXPOSURE_UNKNOWN, True),
+        ([{"time": None}], [{}], Code.EXPOSURE_UNKNOWN, False),
+        ([{"time": None}, {}], [], Code.EXPOSURE_UNKNOWN, False),
     ],
 )
 def test_what_one_file_states_and_another_lacks_is_not_taken_for_one_in_silence(

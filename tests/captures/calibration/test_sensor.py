@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.captures.file_factory import file_of
+from tests.captures.file_factory import exposure_of_file, file_of
 from tests.captures.test_camera_tags import EXIF, MICASENSE
 from unmix_plugin.captures.calibration.references import _open_reference as open_reference
 from unmix_plugin.captures.calibration.references import _panel_reference as panel_reference
@@ -20,10 +20,10 @@ from unmix_plugin.captures.calibration.sensor import (
     prepare_sensor,
     sampled_rows,
 )
+from unmix_plugin.captures.cube import CameraTags, CaptureView, Linear
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.plan import _with_one_exposure as with_one_exposure
 from unmix_plugin.captures.report import Code
-from unmix_plugin.captures.spectral_file import CaptureView, Linear
 
 WAVELENGTHS_NM = np.linspace(400.0, 900.0, 12)
 GENERATOR = np.random.default_rng(0)
@@ -158,8 +158,8 @@ BLOWN = np.array([False, True, False])
         ({}, 4095, np.uint16, 4095.0),
         ({}, 4095, np.uint16, 65535.0),  # which no posed view tells
         ({"linear": Linear(np.full(3, 1e-4), np.zeros(3), "a header")}, 4095, np.uint16, 4095.0),
-        ({"metadata": {"encoding": "sRGB"}}, 255, np.uint8, 255.0),
-        ({"metadata": {"xmp": MICASENSE, "exif": EXIF}}, 65520, np.uint16, 65520.0),
+        ({"is_srgb": True}, 255, np.uint8, 255.0),
+        ({"camera": CameraTags(MICASENSE, EXIF)}, 65520, np.uint16, 65520.0),
     ],
 )
 def test_a_blown_out_white_is_told_by_its_stored_numbers(facts, top, dtype, saturation):
@@ -177,7 +177,7 @@ def test_a_blown_out_white_is_told_by_its_stored_numbers(facts, top, dtype, satu
 def together(cubes: dict[str, np.ndarray], facts: dict[str, dict]):
     """The sensors of files that one camera wrote, as they are brought to one exposure."""
     bands = np.array([500.0, 600.0, 700.0])
-    files = {name: file_of(cube, bands, metadata=facts[name]) for name, cube in cubes.items()}
+    files = {name: file_of(cube, bands, **facts[name]) for name, cube in cubes.items()}
     options = ProcessOptions("cubes", data=Path(), output_dir=Path())
     each = {name: [CaptureView(name, file, name)] for name, file in files.items()}
     sensors = {name: prepare_sensor(own, options, (None, None), own) for name, own in each.items()}
@@ -189,14 +189,15 @@ def together(cubes: dict[str, np.ndarray], facts: dict[str, dict]):
     [
         (np.uint16, 3000.0, {}, "each is brought to that of the first view, 0.01"),
         (np.float32, 0.3, {}, "values are not divided by that, as they are at most about 1"),
-        (np.uint8, 90.0, {"encoding": "sRGB"}, "which can't be undone as cameras bend the brightness"),
+        (np.uint8, 90.0, {"is_srgb": True}, "which can't be undone as cameras bend the brightness"),
     ],
 )
 def test_sensors_of_one_camera_have_one_exposure_or_it_is_said_why_not(dtype, scale, facts, said):
     """Views of two sizes, the second taken at twice the time."""
     light = GENERATOR.random((12, 10, 3)) + 0.2
     cubes = {name: (scale * ratio * light).astype(dtype) for name, ratio in (("10x12", 1), ("12x10", 2))}
-    times = {"10x12": facts | {"exposure_s": 0.01}, "12x10": facts | {"exposure_s": 0.02}}
+    times = {name: {"exposure": exposure_of_file(time)} for name, time in (("10x12", 0.01), ("12x10", 0.02))}
+    times = {name: facts | own for name, own in times.items()}
     upright, across = together(cubes, times)
     assert said in " ".join(remark.sentence for remark in upright.remarks)
     assert np.allclose(across.sample, upright.sample, rtol=1e-2) == (dtype == np.uint16)
@@ -205,7 +206,8 @@ def test_sensors_of_one_camera_have_one_exposure_or_it_is_said_why_not(dtype, sc
 def test_what_is_wrong_with_exposures_of_one_sensor_is_said_once():
     """One with times that can't be those of its bands, beside one without any."""
     cube = np.full((12, 10, 3), 1000, np.uint16) + np.arange(10, dtype=np.uint16)[:, None]
-    times = {"a": {"exposure_s": [0.01, 0.02]}, "b": {"exposure_s": [0.01, 0.04]}}
+    times = {"a": [0.01, 0.02], "b": [0.01, 0.04]}
+    times = {name: {"exposure": exposure_of_file(own)} for name, own in times.items()}
     for sensor in together({"a": cube, "b": cube}, times):
         (remark,) = sensor.remarks
         assert remark.code is Code.EXPOSURES_MISFIT

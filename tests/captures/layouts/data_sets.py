@@ -7,7 +7,7 @@ import numpy as np
 import OpenEXR
 from PIL import Image
 
-from unmix_plugin.captures.spectral_file import ReadOptions
+from unmix_plugin.captures.cube import ReadOptions
 
 PLAIN = ReadOptions()
 

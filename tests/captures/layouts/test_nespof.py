@@ -17,6 +17,7 @@ from tests.captures.layouts.data_sets import (
     write_nespof,
     write_real,
 )
+from unmix_plugin.captures.cube import ReadOptions
 from unmix_plugin.captures.layouts.transforms import (
     _open_intensity,
     _open_opacity,
@@ -24,7 +25,6 @@ from unmix_plugin.captures.layouts.transforms import (
     find_nespof_real,
 )
 from unmix_plugin.captures.readers.exr import channel_names
-from unmix_plugin.captures.spectral_file import ReadOptions
 from unmix_plugin.errors import CaptureError
 
 

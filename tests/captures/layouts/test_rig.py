@@ -27,10 +27,10 @@ from tests.captures.layouts.rig_flight import (
 )
 from tests.captures.layouts.rig_flight import tags as tags_of
 from tests.captures.poses.pose_factory import by_hand
+from unmix_plugin.captures.cube import CameraTags, Cube, ReadOptions
 from unmix_plugin.captures.layouts.rig import _splits_of, find_rig, lens_of
 from unmix_plugin.captures.names import natural_order
 from unmix_plugin.captures.poses.lens import Lens
-from unmix_plugin.captures.spectral_file import ReadOptions, SpectralFile
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.scenes.reading.loader import load_scene
 
@@ -261,9 +261,9 @@ DJI = {
 }
 
 
-def file_with(xmp, exif=EXIF) -> SpectralFile:
+def file_with(xmp, exif=EXIF) -> Cube:
     nothing = np.broadcast_to(np.uint16(0), (LENS_HEIGHT, LENS_WIDTH, 1))
-    return replace(file_of(nothing, metadata={"xmp": xmp, "exif": exif}), path=Path("a.tif"))
+    return replace(file_of(nothing, camera=CameraTags(xmp, exif)), path=Path("a.tif"))
 
 
 GRID = np.stack(np.meshgrid(np.linspace(-0.8, 0.8, 161), np.linspace(-0.65, 0.65, 131)), -1).reshape(-1, 2)

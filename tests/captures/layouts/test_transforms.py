@@ -25,9 +25,9 @@ from tests.captures.layouts.data_sets import (
     write_real,
     write_unmix,
 )
+from unmix_plugin.captures.cube import ReadOptions
 from unmix_plugin.captures.layouts.transforms import find_nerfstudio, find_unmix_nerf
 from unmix_plugin.captures.options import LAYOUTS, find_views
-from unmix_plugin.captures.spectral_file import ReadOptions
 from unmix_plugin.errors import CaptureError, ConfigError
 from unmix_plugin.scenes.reading.loader import load_scene
 

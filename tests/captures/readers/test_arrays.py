@@ -13,9 +13,9 @@ import torch
 
 from tests.captures.file_factory import ARRAY_WRITERS, check_file, present, rows_and_bands_of
 from unmix_plugin.captures.calibration.references import find_missing, finished_by, stated_reflectance
+from unmix_plugin.captures.cube import ReadOptions
 from unmix_plugin.captures.readers import containers
 from unmix_plugin.captures.readers.opening import open_spectral_file
-from unmix_plugin.captures.spectral_file import ReadOptions
 from unmix_plugin.errors import CaptureError
 
 CUBE = np.random.default_rng(0).integers(0, 9000, (8, 9, 5)).astype(np.uint16)

@@ -10,9 +10,9 @@ import spectral.io.envi as spy
 import tifffile
 
 from tests.captures.file_factory import AXES, check_file, header_text, present, rows_and_bands_of, write_envi
+from unmix_plugin.captures.cube import ReadOptions
 from unmix_plugin.captures.layouts.cubes import find_cubes
 from unmix_plugin.captures.readers.opening import open_spectral_file
-from unmix_plugin.captures.spectral_file import ReadOptions
 from unmix_plugin.errors import CaptureError
 
 CUBE = np.random.default_rng(0).integers(0, 200, (5, 7, 4))

@@ -6,8 +6,8 @@ import pytest
 
 from tests.captures.file_factory import check_file, rows_and_bands_of
 from unmix_plugin.captures.calibration.references import stated_reflectance
+from unmix_plugin.captures.cube import ReadOptions
 from unmix_plugin.captures.readers.opening import open_spectral_file
-from unmix_plugin.captures.spectral_file import ReadOptions
 from unmix_plugin.errors import CaptureError
 
 HEIGHT, WIDTH = 9, 12
@@ -64,7 +64,7 @@ def test_channels_are_bands_by_rising_wavelength_or_number(tmp_path, ordered, nm
     channels = write_random(tmp_path / "a.exr", [*(ordered[i] for i in stored), *others], dtype)
     file = open_spectral_file(tmp_path / "a.exr")
     check_file(file, nm=nm, names=ordered)
-    assert file.metadata.get("other_channels", []) == others
+    assert file.others.get("other_channels", []) == others
     rows_and_bands_of(file, np.stack([channels[name] for name in ordered], axis=-1))
 
 
@@ -162,8 +162,8 @@ def test_bands_are_found_in_whichever_part_they_are(tmp_path):
     write(tmp_path / "a.exr", (head("rgba"), preview), (head("spectral"), channels(CUBE)))
     file = open_spectral_file(tmp_path / "a.exr")
     check_file(file, nm=[450, 550, 650], values=CUBE)
-    assert [part["name"] for part in file.metadata["parts"]] == ["rgba", "spectral"]
-    assert sorted(file.metadata["other_channels"]) == ["B", "G", "R"]
+    assert [part["name"] for part in file.others["parts"]] == ["rgba", "spectral"]
+    assert sorted(file.others["other_channels"]) == ["B", "G", "R"]
     check_file(open_spectral_file(tmp_path / "a.exr", ReadOptions(dataset="rgba")), values=CUBE)
 
 

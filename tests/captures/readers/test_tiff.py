@@ -19,8 +19,8 @@ from tests.captures.file_factory import (
 )
 from unmix_plugin.captures import numbers
 from unmix_plugin.captures.calibration.references import find_missing
+from unmix_plugin.captures.cube import Cube, ReadOptions
 from unmix_plugin.captures.readers.opening import open_spectral_file
-from unmix_plugin.captures.spectral_file import ReadOptions, SpectralFile
 from unmix_plugin.errors import CaptureError
 
 CUBE = np.random.default_rng(0).integers(0, 60000, (70, 50, 6)).astype(np.uint16)
@@ -42,7 +42,7 @@ STORAGE = {
 }
 
 
-def written(folder: Path, image: np.ndarray, name: str = "a.tif", **options: Any) -> SpectralFile:
+def written(folder: Path, image: np.ndarray, name: str = "a.tif", **options: Any) -> Cube:
     """An image as tifffile writes it, opened; bands beside each other in each pixel unless options say otherwise."""
     given: dict[str, Any] = {"photometric": "minisblack"}
     given |= {} if "metadata" in options or image.ndim == 2 else {"planarconfig": "contig"}
@@ -152,7 +152,7 @@ SAID: list[tuple[dict[str, Any], dict[str, Any]]] = [
     ),
     (XMP, {"nm": [717], "fwhm": [10], "names": ["Red edge"]}),
     ({"extratags": [(274, "H", 1, 6, True)]}, {"orientation": 6, "values": CUBE}),  # which is not followed
-    ({"extratags": [(274, "H", 1, 1, True)]}, {"orientation": None, "geo_reference": None}),
+    ({"extratags": [(274, "H", 1, 1, True)]}, {"orientation": 1, "is_geotiff": False}),
     ({"extratags": PLACES}, {"geo_reference": "GeoTIFF"}),
     (AS_RGB | {"image": OPAQUE, "extrasamples": ["unassalpha"]}, {"values": OPAQUE, "warning": "as opacity"}),
     (AS_RGB, {"values": COLOURS, "warning": "red, green and blue are taken as light, as stored"}),

@@ -25,8 +25,8 @@ from unmix_plugin.captures.calibration.references import (
     refuse_outside,
     stated_values,
 )
+from unmix_plugin.captures.cube import Cube
 from unmix_plugin.captures.poses.lens import Lens
-from unmix_plugin.captures.spectral_file import SpectralFile
 from unmix_plugin.errors import ConfigError
 
 
@@ -139,7 +139,7 @@ class Calibration:
 
     def rows(
         self,
-        file: SpectralFile,
+        file: Cube,
         first: int,
         last: int,
         opacity: UInt8[np.ndarray, "h w"] | None = None,
@@ -176,7 +176,7 @@ class Calibration:
         values[missing] = 0.0
         return CalibratedRows(values.astype(np.float32, copy=False), saturated, missing)
 
-    def _values(self, file: SpectralFile, whole: np.ndarray, rows: slice) -> Float32[np.ndarray, "h W b"]:
+    def _values(self, file: Cube, whole: np.ndarray, rows: slice) -> Float32[np.ndarray, "h W b"]:
         columns, bands = self.raster.columns, self.bands
         values = stated_values(file, whole, rows, bands)[:, columns]  # a new array, free to be changed
         dark, white = self.own.get(file.path, (self.dark, self.white))

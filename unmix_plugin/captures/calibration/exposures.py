@@ -11,42 +11,41 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float64
 
 from unmix_plugin.captures.calibration.references import finished_by
+from unmix_plugin.captures.cube import Cube
 from unmix_plugin.captures.report import Code, Remark
-from unmix_plugin.captures.spectral_file import SpectralFile
 
 
-def exposure_of(file: SpectralFile, to_light: bool = True) -> Float64[np.ndarray, " b"] | None:
+def exposure_of(file: Cube, to_light: bool = True) -> Float64[np.ndarray, " b"] | None:
     """Exposure time times gain, and over the square of the f-number if that is known, one number or one a band; None
     where the file does not say the time.
 
     Args:
         to_light: Whether the aperture counts, which lets in light but no dark current.
     """
-    time, gain = file.metadata.get("exposure_s"), file.metadata.get("gain", 1.0)
-    f_number = file.metadata.get("f_number", 1.0) if to_light else 1.0
-    try:
-        exposure = np.asarray(time, dtype=np.float64) * np.asarray(gain, dtype=np.float64)
-        exposure = np.atleast_1d(exposure / f_number**2)
-    except (TypeError, ValueError):
+    time, gain, f_number = file.exposure.time, file.exposure.gain, file.exposure.f_number
+    factors = [np.array(factor.numbers) for factor in (time, gain) if factor is not None]
+    if time is None or any(len(factor) not in (1, file.shape[2]) for factor in factors):
         return None
-    is_usable = len(exposure) in (1, file.shape[2]) and np.isfinite(exposure).all() and (exposure > 0).all()
-    return exposure if is_usable else None
+    exposure = np.multiply.reduce(np.broadcast_arrays(*factors))
+    exposure = exposure if f_number is None or not to_light else exposure / f_number**2
+    return exposure if np.isfinite(exposure).all() and (exposure > 0).all() else None
 
 
 @dataclass(frozen=True)
 class ExposedFiles:
     """Files whose exposures are compared: of one sensor, or one file of each of several."""
 
-    views: Sequence[SpectralFile]
+    views: Sequence[Cube]
     """At least one."""
-    whites: Sequence[SpectralFile] = ()
+    whites: Sequence[Cube] = ()
     """References of all views, or one a view."""
-    darks: Sequence[tuple[SpectralFile, SpectralFile]] = ()
+    darks: Sequence[tuple[Cube, Cube]] = ()
     """Each dark frame with a view or a white that it is subtracted from."""
     is_srgb: bool = False
     """Whether the files are pictures for people, in which twice the exposure is not twice the number."""
@@ -64,7 +63,7 @@ class ExposedFiles:
         return [exposure for file in self.whites if (exposure := exposure_of(file)) is not None]
 
     @property
-    def stating(self) -> list[SpectralFile]:
+    def stating(self) -> list[Cube]:
         """Views and whites that state an exposure."""
         return [file for file in (*self.views, *self.whites) if exposure_of(file) is not None]
 
@@ -78,9 +77,9 @@ class ExposedFiles:
         """The exposures of the views, for sentences."""
         return {"exposed": _range(self.known), "unit": _unit(self.stating)}
 
-    def lacking(self, factor: str) -> list[SpectralFile]:
+    def lacking(self, factor: Literal["gain", "f_number"]) -> list[Cube]:
         """Files without a factor of the exposure that others of those with a time state."""
-        without = [file for file in self.stating if factor not in file.metadata]
+        without = [file for file in self.stating if getattr(file.exposure, factor) is None]
         return without if len(without) < len(self.stating) else []
 
 
@@ -125,12 +124,11 @@ def _why_not(files: ExposedFiles, has_misfits: bool) -> list[Remark] | None:
     if missing:
         is_partial = bool(files.known or files.of_whites) and not has_misfits
         return [Remark.of(Code.EXPOSURE_UNKNOWN, missing=missing)] if is_partial else []
-    for factor, name in (("f_number", "f-number of the lens"), ("gain", "gain")):
-        lacking = files.lacking(factor)
-        others = [file.metadata[factor] for file in files.stating if factor in file.metadata]
-        if lacking and (
-            factor == "f_number" or np.any(np.concatenate([np.ravel(one) for one in others]) != 1)
-        ):
+    gains = {file.exposure.gain.numbers for file in files.stating if file.exposure.gain is not None}
+    unknown = {"f-number of the lens": files.lacking("f_number")}
+    unknown |= {"gain": files.lacking("gain")} if gains != {(1.0,)} else {}
+    for name, lacking in unknown.items():
+        if lacking:
             names = [file.path.name for file in lacking]
             return [Remark.of(Code.EXPOSURE_FACTOR_UNKNOWN, factor=name, lacking=names)]
     if files.is_srgb:
@@ -140,7 +138,7 @@ def _why_not(files: ExposedFiles, has_misfits: bool) -> list[Remark] | None:
     return None
 
 
-def _unlike_darks(darks: Sequence[tuple[SpectralFile, SpectralFile]]) -> list[Remark]:
+def _unlike_darks(darks: Sequence[tuple[Cube, Cube]]) -> list[Remark]:
     """A warning of dark frames that were exposed otherwise than what they are subtracted from."""
     pairs = [(exposure_of(dark, False), exposure_of(other, False)) for dark, other in darks]
     unlike = [(a, b) for a, b in pairs if a is not None and b is not None and not np.array_equal(a, b)]
@@ -151,9 +149,10 @@ def _unlike_darks(darks: Sequence[tuple[SpectralFile, SpectralFile]]) -> list[Re
     return [Remark.of(Code.DARK_EXPOSED_OTHERWISE, of_dark=of_darks, of_others=of_others, unit=unit)]
 
 
-def _unit(files: Sequence[SpectralFile], to_light: bool = True) -> str:
+def _unit(files: Sequence[Cube], to_light: bool = True) -> str:
     """What is counted: only that which some file states."""
-    gain, aperture = (any(name in file.metadata for file in files) for name in ("gain", "f_number"))
+    gain = any(file.exposure.gain is not None for file in files)
+    aperture = any(file.exposure.f_number is not None for file in files)
     return f"s{' times gain' * gain}{' over the square of the f-number' * (aperture and to_light)}"
 
 
@@ -173,13 +172,17 @@ def _range(exposures: Iterable[Float64[np.ndarray, " _"]]) -> str:
 def _misfits(files: ExposedFiles) -> list[Remark]:
     """A warning where exposures are neither one number nor one a band, unless a white has the same ones."""
     every = (*files.views, *files.whites)
-    stated = {repr((file.metadata.get("exposure_s"), file.metadata.get("gain"))) for file in every}
+    stated = {
+        tuple(factor and factor.numbers for factor in (file.exposure.time, file.exposure.gain))
+        for file in every
+    }
     if files.whites and len(stated) == 1:
         return []
     found: dict[str, tuple[int, int]] = {}
     for file in every:
-        sizes = {np.size(file.metadata.get(name, 1.0)) for name in ("exposure_s", "gain")}
-        if (odd := sizes - {1, file.shape[2]}) and "exposure_s" in file.metadata:
+        time, gain = file.exposure.time, file.exposure.gain
+        sizes = {len(factor.numbers) for factor in (time, gain) if factor is not None}
+        if (odd := sizes - {1, file.shape[2]}) and time is not None:
             found[file.path.name] = max(odd), file.shape[2]
     if not found:
         return []
@@ -188,12 +191,17 @@ def _misfits(files: ExposedFiles) -> list[Remark]:
     return [Remark.of(Code.EXPOSURES_MISFIT, [*found], numbers=numbers, bands=bands)]
 
 
-def _missing_units(files: Iterable[SpectralFile]) -> Iterator[Remark]:
+def _missing_units(files: Iterable[Cube]) -> Iterator[Remark]:
     """Warnings where units are missing and matter."""
-    metadata = [file.metadata for file in files if "exposure_s" in file.metadata]
-    for what, factor in (("exposure", "exposure times"), ("gain", "gains")):
-        evidence = sorted({str(own.get(f"{what}_evidence", "")) for own in metadata} - {""})
-        guessed = [text for text in evidence if "no unit" in text]
-        gains = {repr(own.get("gain", 1.0)) for own in metadata}
-        if guessed and (len(guessed) < len(evidence) if what == "exposure" else len(gains) > 1):
-            yield Remark.of(Code.EXPOSURE_UNITS_MISSING, factor=factor, evidence="; ".join(evidence))
+    exposures = [file.exposure for file in files if file.exposure.time is not None]
+    times = {one.time for one in exposures if one.time is not None and one.time.source}
+    gains = {one.gain for one in exposures if one.gain is not None and one.gain.source}
+    has_some_units = any(time.assumed for time in times) and not all(time.assumed for time in times)
+    gains_differ = len({(1.0,) if one.gain is None else one.gain.numbers for one in exposures}) > 1
+    for name, factors, matters in (
+        ("exposure times", times, has_some_units),
+        ("gains", gains, gains_differ and any(gain.assumed for gain in gains)),
+    ):
+        if matters:
+            sources = "; ".join(sorted({factor.description for factor in factors}))
+            yield Remark.of(Code.EXPOSURE_UNITS_MISSING, factor=name, sources=sources)

@@ -5,7 +5,6 @@ Notation: `H x W` pixels and `B` bands of a file, of which `h` rows and `b` band
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -16,14 +15,14 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from unmix_plugin.captures.camera_tags import radiometric_model
-from unmix_plugin.captures.options import ProcessOptions
-from unmix_plugin.captures.spectral_file import (
-    GIVEN,
+from unmix_plugin.captures.cube import (
     BandIndex,
     CaptureView,
-    SpectralFile,
+    Cube,
+    Meaning,
     find_missing,
 )
+from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.errors import CaptureError, ConfigError, SpectrumError, counted, name_some
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.srgb import decode_srgb
@@ -38,42 +37,21 @@ _MOST_PATTERN = 4.0
 """Ratio of the variance of blocks' means to that which noise alone would leave, above which rows differ."""
 
 
-_OF_RADIANCE = ("radiance", "data gain", "data offset")
-"""In the evidence of gains that make radiance of numbers."""
-_REFLECTANCE = re.compile(r"(?<![a-z])reflectance(?![a-z])", re.IGNORECASE)
-"""The word in names: REFLECTANCE_212, site/reflectance."""
-
-
-def is_srgb(file: SpectralFile) -> bool:
-    """Whether the file is a picture for people."""
-    return file.metadata.get("encoding") == "sRGB"
-
-
-def stated_reflectance(file: SpectralFile, by_name: bool = True) -> str | None:
+def stated_reflectance(file: Cube, by_name: bool = True) -> str | None:
     """Where a file says that its values are reflectances; None where it does not, or says what else they are.
 
     Args:
-        by_name: Whether its name may say so, of numbers that are not raw: whole ones without a gain are, whatever their
-            name (reflectance_target).
+        by_name: Whether its name may say so.
     Source: NV5, ENVI Header Files (`reflectance scale factor`); Fichet et al. 2021, spectral OpenEXR (layer `T`).
     """
-    if is_srgb(file) or radiometric_model(file) is not None:
+    if file.is_srgb or radiometric_model(file) is not None:
         return None
-    evidence = "" if file.linear is None else file.linear.evidence
-    if "reflectance" in evidence.lower():
-        return evidence
-    header = file.metadata.get("header")
-    if isinstance(header, dict) and "reflectance scale factor" in header:  # of 1, which changes nothing
-        return "header field 'reflectance scale factor'"
-    if file.reader == "exr" and (file.bands.names or ("",))[0].startswith("T."):
-        return "the layer T"
-    names = (file.path.stem, str(file.metadata.get("dataset", "")))
-    by_name &= file.dtype.kind == "f" or file.linear is not None
-    named = next((name for name in names if by_name and _REFLECTANCE.search(name)), None)
-    return None if named is None else f"the name {named}"
+    if file.meaning is Meaning.REFLECTANCE:
+        return file.meaning_source
+    return f"the name {file.reflectance_name}" if by_name and file.reflectance_name else None
 
 
-def finished_by(file: SpectralFile, by_name: bool = True) -> str | None:
+def finished_by(file: Cube, by_name: bool = True) -> str | None:
     """Where a file says that its values are reflectance or radiance, in which the exposure is accounted for; None where
     it does not. Software keeps the exposure time of the raw file in the header of such values.
 
@@ -81,20 +59,18 @@ def finished_by(file: SpectralFile, by_name: bool = True) -> str | None:
         by_name: Whether its name may say that they are reflectance.
     Source: NV5, ENVI Header Files (`data gain values` in W/(m2 um sr)).
     """
-    evidence = "" if file.linear is None else file.linear.evidence
-    is_radiance = any(word in evidence.lower().replace("_", " ") for word in _OF_RADIANCE)
-    return evidence if is_radiance else stated_reflectance(file, by_name)
+    return file.meaning_source if file.meaning is Meaning.RADIANCE else stated_reflectance(file, by_name)
 
 
 def stated_values(
-    file: SpectralFile, stored: np.ndarray, rows: slice, bands: BandIndex = slice(None)
+    file: Cube, stored: np.ndarray, rows: slice, bands: BandIndex = slice(None)
 ) -> Float32[np.ndarray, "h W b"]:
     """Values of some whole rows: pictures decoded, and the calibration applied that the file carries itself.
 
     Args:
         stored: Numbers (h, W, b) that were read of these rows and bands.
     """
-    if is_srgb(file):
+    if file.is_srgb:
         top = np.iinfo(stored.dtype).max
         return decode_srgb(np.arange(top + 1) / top).astype(np.float32)[stored]
     model = radiometric_model(file)
@@ -103,15 +79,12 @@ def stated_values(
     return stored.astype(np.float32) if file.linear is None else file.linear.apply(stored, bands)
 
 
-def require_comparable(file: SpectralFile, other: SpectralFile) -> None:
+def require_comparable(file: Cube, other: Cube) -> None:
     """Refuse a file whose bands are other ones than those of another file of the capture, or whose numbers are of
     another unit: gains, or a maker's calibration, in one alone. Raises CaptureError."""
     found, expected = file.bands.wavelengths_nm, other.bands.wavelengths_nm
-    if (
-        found is not None
-        and expected is not None
-        and GIVEN not in (file.bands.evidence, other.bands.evidence)
-    ):
+    is_given = file.bands.is_given or other.bands.is_given
+    if found is not None and expected is not None and not is_given:
         band = int(np.argmax(np.abs(found - expected)))
         if abs(found[band] - expected[band]) > _LARGEST_DIFFERENCE_NM:
             raise CaptureError(
@@ -120,7 +93,7 @@ def require_comparable(file: SpectralFile, other: SpectralFile) -> None:
             )
     maker, other_maker = (model and model.maker for model in map(radiometric_model, (file, other)))
     for what, own, others in (
-        ("gains or scale", file.linear and file.linear.evidence, other.linear and other.linear.evidence),
+        ("gains or scale", file.linear and file.linear.source, other.linear and other.linear.source),
         ("calibration of its maker in its XMP", maker, other_maker),
     ):
         if (own is None) != (others is None):
@@ -131,9 +104,7 @@ def require_comparable(file: SpectralFile, other: SpectralFile) -> None:
             )
 
 
-def _measured(
-    file: SpectralFile, rows: slice, bands: BandIndex = slice(None)
-) -> Float32[np.ndarray, "h W b"]:
+def _measured(file: Cube, rows: slice, bands: BandIndex = slice(None)) -> Float32[np.ndarray, "h W b"]:
     """Values of some rows, NaN where nothing was measured."""
     stored = file.read(rows, bands)
     values = stated_values(file, stored, rows, bands)
@@ -145,7 +116,7 @@ def _measured(
 class Reference:
     """A measured reference, brought to the columns of the cubes."""
 
-    file: SpectralFile
+    file: Cube
     mean: Float32[np.ndarray, "1 columns B"]
     """Mean over its lines; one column where it stands for all."""
     is_per_pixel: bool
@@ -185,7 +156,7 @@ class Reference:
         return own - np.nanmean(behind, axis=(0, 1), dtype=np.float64)
 
 
-def _open_reference(file: SpectralFile, what: str, cube: SpectralFile) -> Reference:
+def _open_reference(file: Cube, what: str, cube: Cube) -> Reference:
     """A reference for the cubes of one sensor.
 
     A file with as many rows and columns as the cubes is used pixel by pixel if its rows differ by more than noise (a
@@ -221,7 +192,7 @@ def _open_reference(file: SpectralFile, what: str, cube: SpectralFile) -> Refere
     return Reference(file, mean.mean(axis=1, keepdims=True), False, how)
 
 
-def _open_white(file: SpectralFile, own_dark: SpectralFile | None, cube: SpectralFile) -> Reference:
+def _open_white(file: Cube, own_dark: Cube | None, cube: Cube) -> Reference:
     """A white reference with the dark frame that was taken for it alone, if there is one."""
     white = _open_reference(file, "white reference", cube)
     if own_dark is None:
@@ -230,7 +201,7 @@ def _open_white(file: SpectralFile, own_dark: SpectralFile | None, cube: Spectra
     return replace(white, dark=dark, how=f"{white.how}; less a dark frame of its own ({dark.how})")
 
 
-def _panel_reference(cube: SpectralFile, rectangle: tuple[int, int, int, int], view: str) -> Reference:
+def _panel_reference(cube: Cube, rectangle: tuple[int, int, int, int], view: str) -> Reference:
     """The mean of a rectangle of a view as the white reference of all.
 
     Args:
@@ -259,7 +230,7 @@ def refuse_outside(what: str, rectangle: tuple[int, int, int, int], size: tuple[
         raise ConfigError(f"{where} leaves the image of {size[0]} rows and {size[1]} columns")
 
 
-def _column_means(file: SpectralFile) -> tuple[Float32[np.ndarray, "1 W B"], float]:
+def _column_means(file: Cube) -> tuple[Float32[np.ndarray, "1 W B"], float]:
     """Mean over lines, and how much more than noise the rows differ, judged on a few bands."""
     height, width, bands = file.shape
     total, count = np.zeros((width, bands)), np.zeros((width, bands))
@@ -347,7 +318,7 @@ def find_references(
     views: Sequence[CaptureView],
     wavelengths_nm: Float64[np.ndarray, " B"],
     options: ProcessOptions,
-    files: tuple[SpectralFile | None, SpectralFile | None],
+    files: tuple[Cube | None, Cube | None],
     all_views: Sequence[CaptureView],
 ) -> tuple[References, dict[Path, References]]:
     """References of all views of a sensor, and those of views that were taken with their own, by cube.
@@ -412,13 +383,13 @@ def _panel_in_view(
     return panel if dark is None else replace(panel, dark=_open_reference(dark, "dark frame", view.cube))
 
 
-def _own_dark(file: SpectralFile, beside: SpectralFile | None = None) -> SpectralFile | None:
+def _own_dark(file: Cube, beside: Cube | None = None) -> Cube | None:
     """The dark frame that lies beside a file, otherwise its own dark lines, if its numbers are raw: dark lines of what
     was brought to reflectance are near 0."""
     return beside or (None if finished_by(file) else file.dark)
 
 
-def own_dark_mean(file: SpectralFile) -> Float32[np.ndarray, "1 W B"] | None:
+def own_dark_mean(file: Cube) -> Float32[np.ndarray, "1 W B"] | None:
     """Mean of the lines of a file that were taken with the shutter closed; None where it has none or its numbers are
     not raw. Raises CaptureError: a column of them holds no measurement."""
     dark = _own_dark(file)
@@ -426,8 +397,8 @@ def own_dark_mean(file: SpectralFile) -> Float32[np.ndarray, "1 W B"] | None:
 
 
 def _each_view(
-    files: Sequence[SpectralFile | None], views: Sequence[CaptureView], what: str, is_given: bool
-) -> Sequence[SpectralFile | None]:
+    files: Sequence[Cube | None], views: Sequence[CaptureView], what: str, is_given: bool
+) -> Sequence[Cube | None]:
     """A reference for each view: its own, or the only one that there is; none where the user gives one for all."""
     known = {file.path: file for file in files if file is not None}
     missing = [view.name for view, file in zip(views, files, strict=True) if file is None]

@@ -23,15 +23,14 @@ from unmix_plugin.captures.calibration.references import (
     References,
     find_missing,
     find_references,
-    is_srgb,
     stated_reflectance,
     stated_values,
 )
 from unmix_plugin.captures.camera_tags import radiometric_model
+from unmix_plugin.captures.cube import MOST_WIDTH, BandIndex, CaptureView, Cube
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.poses.pose_set import PosedCamera
 from unmix_plugin.captures.report import Code, Remark
-from unmix_plugin.captures.spectral_file import MOST_WIDTH, BandIndex, CaptureView, SpectralFile
 from unmix_plugin.captures.spoilt import ViewPixels, judge_values
 from unmix_plugin.captures.wavelengths import in_ranges
 from unmix_plugin.errors import CaptureError
@@ -173,7 +172,7 @@ class Sensor:
 def prepare_sensor(
     views: Sequence[CaptureView],
     options: ProcessOptions,
-    references: tuple[SpectralFile | None, SpectralFile | None],
+    references: tuple[Cube | None, Cube | None],
     all_views: Sequence[CaptureView],
     cameras: Mapping[str, PosedCamera] | None = None,
 ) -> Sensor:
@@ -209,13 +208,13 @@ def prepare_sensor(
     choice.require(binning, str(first.path))
     exposure = None
     if model is None:  # a maker's calibration accounts for exposures already
-        darks: list[tuple[SpectralFile, SpectralFile]] = []
+        darks: list[tuple[Cube, Cube]] = []
         for file in files:
             its_dark, used = own.get(file.path, (dark, white))
             darks += [(its_dark.file, file)] if its_dark else []
             darks += [(used.dark.file, used.file)] if used and used.dark else []
         of_whites = [one.file for one in whites]
-        exposed = ExposedFiles(files, of_whites, darks, is_srgb(first), may_be_reflectance(files))
+        exposed = ExposedFiles(files, of_whites, darks, first.is_srgb, may_be_reflectance(files))
         compared = compare_exposures(exposed)
         exposure = compared.common
         remarks += compared.remarks
@@ -235,7 +234,7 @@ def prepare_sensor(
         lamp = lamp[choice.kept].astype(np.float32).reshape(-1, binning).mean(axis=1).astype(np.float64)
         lamp = np.clip(lamp, 0.0, None) / lamp.max()
     # Floating-point numbers may have been brought to what stands for 1 already.
-    has_one = is_srgb(first) or first.linear is not None or (first.dtype.kind == "f" and model is None)
+    has_one = first.is_srgb or first.linear is not None or (first.dtype.kind == "f" and model is None)
     linear = None if model is not None else first.linear
     states_one = linear is not None and linear.scale is not None
     states_one |= has_one and stated_reflectance(first, by_name=False) is not None
@@ -259,7 +258,7 @@ def prepare_sensor(
     )
 
 
-def may_be_reflectance(files: Sequence[SpectralFile]) -> bool:
+def may_be_reflectance(files: Sequence[Cube]) -> bool:
     """Whether the values of sampled rows of most of some files were brought to what stands for 1, perhaps."""
     if files[0].dtype.kind != "f" and files[0].linear is None:
         return False
@@ -274,7 +273,7 @@ def may_be_reflectance(files: Sequence[SpectralFile]) -> bool:
     return len(bright) > 0 and 0.0 < float(np.median(bright)) <= _MOST_REFLECTANCE
 
 
-def _stated_bands(files: Sequence[SpectralFile], options: ProcessOptions) -> _BandChoice:
+def _stated_bands(files: Sequence[Cube], options: ProcessOptions) -> _BandChoice:
     """Bands that no file marks as bad, by the wavelengths of the first."""
     file = files[0]
     wavelengths = file.bands.wavelengths_nm
@@ -294,9 +293,9 @@ def _stated_bands(files: Sequence[SpectralFile], options: ProcessOptions) -> _Ba
     return choice
 
 
-def _unit(file: SpectralFile, finished: str | None, has_one: bool) -> str:
+def _unit(file: Cube, finished: str | None, has_one: bool) -> str:
     """What values are without a white reference; `finished` is where all files say that they are reflectances."""
-    if is_srgb(file):
+    if file.is_srgb:
         return "linear light of pictures in sRGB"
     if finished is not None:
         return f"{'' if has_one else 'relative '}reflectance, as {finished} says"
@@ -307,7 +306,7 @@ def _unit(file: SpectralFile, finished: str | None, has_one: bool) -> str:
         return "relative radiance"
     if file.linear.scale is not None:
         return "stored numbers divided by the scale factor of the files"
-    return f"stored numbers times a gain plus an offset ({file.linear.evidence})"
+    return f"stored numbers times a gain plus an offset ({file.linear.source})"
 
 
 def _evidence(
@@ -340,7 +339,7 @@ def sampled_rows(height: int) -> list[int]:
     return [int((index + 0.5) * height / count) for index in range(count)]
 
 
-def _find_saturation(files: Sequence[SpectralFile], bands: np.ndarray) -> tuple[float | None, str]:
+def _find_saturation(files: Sequence[Cube], bands: np.ndarray) -> tuple[float | None, str]:
     """The stored number at which a detector ends, from a plateau at the greatest one, and the evidence."""
     dtype = files[0].dtype
     is_wide = dtype.kind not in "iu" or dtype.itemsize > 2  # a detector's, or processed
@@ -372,7 +371,7 @@ def _find_saturation(files: Sequence[SpectralFile], bands: np.ndarray) -> tuple[
     return float(high), f"no plateau below the end of {dtype.name}; {said}"
 
 
-def _stored_pixels(file: SpectralFile, row: int, bands: BandIndex = slice(None)) -> Shaped[np.ndarray, "N b"]:
+def _stored_pixels(file: Cube, row: int, bands: BandIndex = slice(None)) -> Shaped[np.ndarray, "N b"]:
     """Stored numbers of the pixels of a row that have a measurement."""
     stored = file.read(slice(row, row + 1), bands)
     return stored[~find_missing(stored, file, slice(row, row + 1), bands)]
@@ -448,7 +447,7 @@ def _draw_sample(views: Sequence[CaptureView], calibration: Calibration) -> list
     return drawn
 
 
-def _pooled(drawn: Sequence[ViewPixels], first: SpectralFile) -> _Sample:
+def _pooled(drawn: Sequence[ViewPixels], first: Cube) -> _Sample:
     """The pixels of all views. Raises CaptureError: there are none."""
     sample = np.concatenate([one.values for one in drawn]), np.concatenate([one.saturated for one in drawn])
     if not len(sample[0]):

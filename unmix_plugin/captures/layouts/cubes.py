@@ -22,10 +22,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from unmix_plugin.captures.cube import Capture, CaptureView, Cube, ReadOptions
 from unmix_plugin.captures.names import natural_order, view_names
 from unmix_plugin.captures.readers.envi import described_image
 from unmix_plugin.captures.readers.opening import open_spectral_file
-from unmix_plugin.captures.spectral_file import Capture, CaptureView, ReadOptions, SpectralFile
 from unmix_plugin.captures.spoilt import UnreadableViews
 from unmix_plugin.errors import CaptureError, name_some
 from unmix_plugin.formats.envi import header_beside
@@ -242,12 +242,10 @@ def _same_name(first: Path, second: Path) -> str:
     return f"{first} and {second} would both be the view '{_name(first)}'; rename or move one of them"
 
 
-def _open(path: Path, options: ReadOptions) -> SpectralFile:
+def _open(path: Path, options: ReadOptions) -> Cube:
     file = open_spectral_file(path, options)
     is_picture = path.suffix.lower() in _PICTURE_SUFFIXES and file.dtype.itemsize == 1
-    if is_picture and "encoding" not in file.metadata:
-        file = replace(file, metadata={**file.metadata, "encoding": "sRGB"})
-    return file
+    return replace(file, is_srgb=True) if is_picture else file
 
 
 def _visible_files(folder: Path) -> list[Path]:

@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -26,11 +26,11 @@ from typing import Any
 import numpy as np
 
 from unmix_plugin.captures.camera_tags import XmpTags, exif_number, tag_numbers, tag_text
+from unmix_plugin.captures.cube import BandTable, Capture, CaptureView, Cube, ReadOptions
 from unmix_plugin.captures.layouts.transforms import Split
 from unmix_plugin.captures.names import natural_order, view_names
 from unmix_plugin.captures.poses.lens import Lens, Points, fit_lens, require_possible
 from unmix_plugin.captures.readers.opening import open_spectral_file
-from unmix_plugin.captures.spectral_file import BandTable, Capture, CaptureView, ReadOptions, SpectralFile
 from unmix_plugin.errors import CaptureError, counted, name_some
 
 _TIFF_SUFFIXES = (".tif", ".tiff")
@@ -97,10 +97,10 @@ def find_rig(root: Path, options: ReadOptions) -> Capture:
     return Capture("rig", root, tuple(ordered), notes=tuple(notes))
 
 
-def _kind_of(file: SpectralFile, options: ReadOptions) -> str:
+def _kind_of(file: Cube, options: ReadOptions) -> str:
     """`band`, or why a file is no view: `colour`, `thermal`, or `broad` where no user gives wavelengths."""
     wavelengths = file.bands.wavelengths_nm
-    name = tag_text(file.metadata.get("xmp") or {}, "BandName") or ""
+    name = tag_text(file.camera.xmp, "BandName") or ""
     if file.shape[2] > 1:
         return "colour"
     if name.upper() == "LWIR" or (wavelengths is not None and float(wavelengths.min()) > _THERMAL_NM):
@@ -146,7 +146,7 @@ def _with_given_bands(views: list[CaptureView], options: ReadOptions) -> list[Ca
 class _BandFile:
     """One file before it is a view."""
 
-    file: SpectralFile
+    file: Cube
     base: str
     """Name up to the band, with its folder."""
     ending: str
@@ -154,7 +154,7 @@ class _BandFile:
 
     @property
     def tags(self) -> XmpTags:
-        return self.file.metadata.get("xmp") or {}
+        return self.file.camera.xmp
 
 
 def _open_band_file(path: Path, root: Path) -> _BandFile:
@@ -208,15 +208,15 @@ def _splits_of(releases: Iterable[str]) -> dict[str, Split]:
     return {release: "eval" if release in evaluated else "train" for release in names}
 
 
-def lens_of(file: SpectralFile) -> tuple[Lens | None, str]:
+def lens_of(file: Cube) -> tuple[Lens | None, str]:
     """The lens of a file; None where its tags don't tell one, and why. Raises CaptureError: its model differs from
     every OPENCV lens by too much, or folds the image over."""
-    tags = file.metadata.get("xmp") or {}
+    tags = file.camera.xmp
     try:
         if tag_numbers(tags, "DewarpData") is not None:
             lens = _dji_lens(file, tags)
         else:
-            lens = _pix4d_lens(file, tags, file.metadata.get("exif") or {})
+            lens = _pix4d_lens(file, tags, file.camera.exif)
         if not lens.is_possible:
             raise _NoLensError("its numbers make no sense")
     except _NoLensError as why:
@@ -229,7 +229,7 @@ class _NoLensError(Exception):
     """Tags tell no lens; the text says why."""
 
 
-def _pix4d_lens(file: SpectralFile, tags: XmpTags, exif: dict[str, Any]) -> Lens:
+def _pix4d_lens(file: Cube, tags: XmpTags, exif: Mapping[str, Any]) -> Lens:
     height, width = file.shape[:2]
     unit = _MM_OF_UNIT.get(exif_number(exif, "FocalPlaneResolutionUnit") or 4.0, 1.0)
     across = (exif_number(exif, "FocalPlaneXResolution") or 0.0) / unit  # pixels a millimetre
@@ -257,7 +257,7 @@ def _pix4d_lens(file: SpectralFile, tags: XmpTags, exif: dict[str, Any]) -> Lens
     return Lens(width, height, focal_px, centre, (k1, k2, p1, p2), (k3, 0.0))
 
 
-def _dji_lens(file: SpectralFile, tags: XmpTags) -> Lens:
+def _dji_lens(file: Cube, tags: XmpTags) -> Lens:
     """`DewarpData`: a date; fx, fy, cx, cy, k1, k2, p1, p2, k3, where cx, cy count from the optical centre. Where
     `DewarpFlag` is not 0, the camera has taken the distortion out of its picture already."""
     height, width = file.shape[:2]

@@ -30,20 +30,20 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
+from unmix_plugin.captures.cube import (
+    BandTable,
+    Capture,
+    CaptureView,
+    Cube,
+    ReadOptions,
+    linear_values,
+)
 from unmix_plugin.captures.names import FoundFiles, natural_order, path_text, view_names
 from unmix_plugin.captures.poses.pose_set import load_json
 from unmix_plugin.captures.poses.reading import frames_of, read_poses, read_transforms
 from unmix_plugin.captures.readers.band_files import stack_bands
 from unmix_plugin.captures.readers.exr import channel_names
 from unmix_plugin.captures.readers.opening import open_spectral_file
-from unmix_plugin.captures.spectral_file import (
-    BandTable,
-    Capture,
-    CaptureView,
-    ReadOptions,
-    SpectralFile,
-    linear_values,
-)
 from unmix_plugin.errors import CaptureError, counted
 from unmix_plugin.scenes.reading.faults import Faults, describe, read_numbers
 from unmix_plugin.scenes.reading.splits import split_by_lists
@@ -306,7 +306,7 @@ def _not_followed(frame: _Frame, bands: tuple[int, ...] | None, num_wavelengths:
         yield f"'bands' is {list(bands)}; expected indices of the {num_wavelengths} 'wavelengths', from 0"
 
 
-def _open_cube(path: Path, stated: _StatedCube, options: ReadOptions) -> SpectralFile:
+def _open_cube(path: Path, stated: _StatedCube, options: ReadOptions) -> Cube:
     """A cube; numbers of 8 bits stand for fractions of 255, unless another number is said to stand for 1."""
     file, bands = open_spectral_file(path, options), stated.bands
     count = 0 if bands is None or bands.wavelengths_nm is None else len(bands.wavelengths_nm)
@@ -317,13 +317,13 @@ def _open_cube(path: Path, stated: _StatedCube, options: ReadOptions) -> Spectra
     scale, why = stated.value_scale, "'value_scale' of transforms.json"
     if scale is not None and file.linear is not None:
         raise CaptureError(
-            f"{path} has gains of its own ({file.linear.evidence}), transforms.json a 'value_scale'; take one of them "
+            f"{path} has gains of its own ({file.linear.source}), transforms.json a 'value_scale'; take one of them "
             "out, as it is unclear which the numbers need"
         )
     if scale is None and file.dtype == np.uint8:
         scale, why = 255.0, "numbers of 8 bits"
     if scale is not None and file.linear is None:
-        file = replace(file, linear=linear_values(path, file.shape[2], [1 / scale], [], why))
+        file = replace(file, linear=linear_values(path, file.shape[2], gains=[1 / scale], source=why))
     if file.bands.wavelengths_nm is not None or bands is None:
         return file
     if count == file.shape[2]:
@@ -416,7 +416,7 @@ def _wavelength_entries(folder: Path, *, is_file: bool) -> dict[float, Path]:
     return dict(sorted(entries.items()))
 
 
-def _stack_intensities(files: dict[float, Path], options: ReadOptions) -> SpectralFile:
+def _stack_intensities(files: dict[float, Path], options: ReadOptions) -> Cube:
     """Files of one view by their wavelength, as one cube."""
     parts = [_open_intensity(file) for file in files.values()]
     stack, given = stack_bands(parts, parts[0].path), options.wavelengths_nm
@@ -430,7 +430,7 @@ def _stack_intensities(files: dict[float, Path], options: ReadOptions) -> Spectr
     return replace(stack, bands=bands)
 
 
-def _open_intensity(path: Path) -> SpectralFile:
+def _open_intensity(path: Path) -> Cube:
     """The first Stokes component, (H, W, 1): by its name, otherwise by the number of channels. Raises CaptureError: the
     file can't be read, or which channel is s0 can't be told."""
     names = channel_names(path)
@@ -446,7 +446,7 @@ def _open_intensity(path: Path) -> SpectralFile:
     return open_spectral_file(path, ReadOptions(named[0]))
 
 
-def _open_opacity(path: Path) -> SpectralFile | None:
+def _open_opacity(path: Path) -> Cube | None:
     """The alpha channel, (H, W, 1), in [0, 1]; None where there is none."""
     channel = _opacity_channel(channel_names(path))
     return None if channel is None else open_spectral_file(path, ReadOptions(channel))

@@ -1,1 +1,1 @@
-"""One file a format, each giving a `SpectralFile` that is opened without being read."""
+"""One file a format, each giving a `Cube` that is opened without being read."""

@@ -15,6 +15,14 @@ from typing import Any
 
 import numpy as np
 
+from unmix_plugin.captures.cube import (
+    BandTable,
+    Cube,
+    Linear,
+    Meaning,
+    ReadOptions,
+    linear_values,
+)
 from unmix_plugin.captures.fields import (
     GOOD,
     NAMES,
@@ -22,23 +30,16 @@ from unmix_plugin.captures.fields import (
     Format,
     check_bands,
     counts_bands,
-    exposure_facts,
     is_exposure,
     listed,
     plain_names,
     says_bands,
     state_bands,
+    state_exposure,
     state_linear,
 )
 from unmix_plugin.captures.names import common_length
 from unmix_plugin.captures.numbers import Axes, Block, Numbers
-from unmix_plugin.captures.spectral_file import (
-    BandTable,
-    Linear,
-    ReadOptions,
-    SpectralFile,
-    linear_values,
-)
 from unmix_plugin.errors import CaptureError, name_some
 from unmix_plugin.limits import MOST_BANDS, MOST_TEXT_BYTES, allow_parts
 
@@ -107,9 +108,7 @@ class FoundArray:
         return is_list and self.dtype.kind in kinds
 
 
-def image_of_arrays(
-    path: Path, reader: str, arrays: Sequence[FoundArray], options: ReadOptions
-) -> SpectralFile:
+def image_of_arrays(path: Path, reader: str, arrays: Sequence[FoundArray], options: ReadOptions) -> Cube:
     """The image of a file: the array that is named, otherwise the only one of three axes."""
     image = _find_image(path, arrays, options)
     what = image.name or "the array"
@@ -141,10 +140,8 @@ def image_of_arrays(
     bands = _without_windows(check_bands(stated, of_image[2], warnings), image)
     linear = _linear(path, image, of_image[2], warnings)
     warnings += _unread(path, image)
-    applied = "" if linear is None else linear.evidence
-    exposure = exposure_facts(
-        {key: entries[key] for key in entries if f"'{key}'" not in applied}, _WHERE, warnings
-    )
+    applied = () if linear is None else linear.entries
+    exposure = state_exposure({key: entries[key] for key in entries if key not in applied}, _WHERE, warnings)
     dtype, no_data, valid = _measured_numbers(image, linear)
 
     others = [
@@ -154,7 +151,7 @@ def image_of_arrays(
         or not (one.own_name in (*_AXES, *_SIDES) or is_exposure(one.own_name) or _lists_bands(one))
         if one is not image
     ]
-    return SpectralFile(
+    return Cube(
         path=path,
         reader=reader,
         shape=of_image,
@@ -166,7 +163,9 @@ def image_of_arrays(
         valid_range=valid,
         notes=(f"also in the file, and not used: {name_some(others)}",) if others else (),
         warnings=tuple(warnings),
-        metadata={**({"dataset": image.name} if len(arrays) > 1 else {}), "axes": axes, **exposure},
+        exposure=exposure,
+        dataset=image.name if len(arrays) > 1 else "",
+        others={"axes": axes},
     )
 
 
@@ -390,11 +389,16 @@ def _prisma(path: Path, image: FoundArray, num_bands: int) -> Linear | None:
     names = (f"L2Scale{part}Min", f"L2Scale{part}Max", f"ScaleFactor_{part}", f"Offset_{part}")
     low, high, factor, offset = (_first_number(image.all_attributes, name.lower()) for name in names)
     if low is not None and high is not None and high > low:
-        what = "radiance" if "prs_l2b_" in image.name.lower() else "reflectance"
-        evidence = f"attribute '{names[0]}' and '{names[1]}' of {what}"
-        return linear_values(path, num_bands, [(high - low) / 65535.0], [low], evidence)
-    evidence = f"attribute '{names[2]}' and '{names[3]}' of radiance"
-    return linear_values(path, num_bands, [1.0 / factor], [-(offset or 0.0)], evidence) if factor else None
+        meaning = Meaning.RADIANCE if "prs_l2b_" in image.name.lower() else Meaning.REFLECTANCE
+        gains, offsets, used = [(high - low) / 65535.0], [low], names[:2]
+    elif factor:
+        meaning, gains, offsets, used = Meaning.RADIANCE, [1.0 / factor], [-(offset or 0.0)], names[2:]
+    else:
+        return None
+    source = f"attribute '{used[0]}' and '{used[1]}' of {meaning.value}"
+    return linear_values(
+        path, num_bands, gains=gains, offsets=offsets, source=source, meaning=meaning, entries=used
+    )
 
 
 def _unread(path: Path, image: FoundArray) -> list[str]:

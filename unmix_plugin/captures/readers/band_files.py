@@ -11,18 +11,22 @@ from typing import Any
 import numpy as np
 
 from unmix_plugin.captures.camera_tags import radiometric_model
+from unmix_plugin.captures.cube import BandTable, Cube, Exposure, Factor, Linear
 from unmix_plugin.captures.names import natural_order
-from unmix_plugin.captures.spectral_file import BandTable, Linear, SpectralFile
 from unmix_plugin.captures.wavelengths import wavelengths_in_names
 from unmix_plugin.errors import CaptureError, name_some
 from unmix_plugin.limits import allow_parts
 
 _KINDS = {".tif": "TIFF", ".tiff": "TIFF", ".png": "PNG", ".exr": "OpenEXR", ".jpg": "JPEG", ".jpeg": "JPEG"}
-_EXPOSURE: dict[str, Any] = {"exposure_s": None, "gain": 1.0, "f_number": 1.0}
-"""Metadata of an exposure, and what counts where a file does not say it."""
+_PLAIN = Cube(Path(), "", (0, 0, 0), np.dtype("u1"))
+"""Says nothing."""
 
 
-def open_band_folder(folder: Path, open_band: Callable[[Path], SpectralFile]) -> SpectralFile:
+_SHARED = ("camera", "is_srgb", "reflectance_source", "dataset", "orientation", "map_entries", "is_geotiff")
+"""Fields that a stack has where all its parts have the same."""
+
+
+def open_band_folder(folder: Path, open_band: Callable[[Path], Cube]) -> Cube:
     """Open the files of a folder as the bands of one image, by rising wavelength or in the order of their names.
 
     Wavelengths are in the files, or in their names. Raises CaptureError: there are no such files, they hold several
@@ -70,10 +74,11 @@ def open_band_folder(folder: Path, open_band: Callable[[Path], SpectralFile]) ->
     return replace(stack, interleave="bsq", notes=stack.notes + notes)
 
 
-def stack_bands(parts: Sequence[SpectralFile], path: Path) -> SpectralFile:
+def stack_bands(parts: Sequence[Cube], path: Path) -> Cube:
     """Files of one view that hold one band each, as one file with all of them, in the order given.
 
-    Metadata are those that all parts share. A number that is no data in one part is missing there alone, but 0 in all.
+    Other facts are those that all parts share. A number that is no data in one part is missing there alone, but 0 in
+    all.
 
     Args:
         parts: At least one, all of one size.
@@ -107,10 +112,12 @@ def stack_bands(parts: Sequence[SpectralFile], path: Path) -> SpectralFile:
         numbers=None,
         parts=tuple(own),
         bands=_table_of([part.bands for part in parts]),
-        linear=Linear(gains, offsets, stated[0].evidence) if stated else None,
+        linear=replace(stated[0], gains=gains, offsets=offsets) if stated else None,
         no_data=tuple(dict.fromkeys(of_all)),
         valid_range=None if differ else first.valid_range,
-        metadata=_shared_metadata(parts, warnings),
+        exposure=_exposure_of_bands(parts, warnings),
+        **{name: _shared(parts, name) for name in _SHARED},
+        others=_other_entries(parts),
         notes=tuple(dict.fromkeys(note for part in parts for note in part.notes)),
         warnings=tuple(warnings),
         sources=tuple(source for part in parts for source in part.files),
@@ -140,43 +147,52 @@ def _table_of(tables: Sequence[BandTable]) -> BandTable:
     )
 
 
-def _shared_metadata(parts: Sequence[SpectralFile], warnings: list[str]) -> dict[str, Any]:
-    """Metadata that all parts share, and lines that their headers do; the others are listed by part."""
-    every = [part.metadata for part in parts]
-    same = {
-        k: value for k, value in every[0].items() if all(repr(own.get(k)) == repr(value) for own in every)
-    }
-    others = [{key: value for key, value in own.items() if key not in same} for own in every]
-    headers = [header for own in every if isinstance(header := own.get("header"), dict)]
+def _shared(parts: Sequence[Cube], name: str) -> Any:
+    """The field of this name where all parts have the same, otherwise its default."""
+    first = getattr(parts[0], name)
+    return first if all(getattr(part, name) == first for part in parts) else getattr(_PLAIN, name)
+
+
+def _other_entries(parts: Sequence[Cube]) -> dict[str, Any]:
+    """Entries that all parts share, and lines that their headers do; what else they say is listed by part."""
+    same, *_ = [dict(part.others) for part in parts]
+    for part in parts:
+        same = {key: value for key, value in same.items() if repr(part.others.get(key)) == repr(value)}
+    headers = [header for part in parts if isinstance(header := part.others.get("header"), dict)]
     if "header" not in same and len(headers) == len(parts):
         shared = set.intersection(*(set(header.items()) for header in headers))
         same["header"] = {key: value for key, value in headers[0].items() if (key, value) in shared}
-    exposure = _exposure_of_bands(parts, warnings)
-    if exposure is not None:
-        same = {key: value for key, value in same.items() if key not in _EXPOSURE} | exposure
-    return same | ({"parts": others} if any(others) else {})
+    facts = [part.facts for part in parts]
+    differ = [
+        {key: value for key, value in own.items() if any(repr(one.get(key)) != repr(value) for one in facts)}
+        for own in facts
+    ]
+    return same | ({"parts": differ} if any(differ) else {})
 
 
-def _exposure_of_bands(parts: Sequence[SpectralFile], warnings: list[str]) -> dict[str, Any] | None:
-    """Time times gain of each band, in s, and the f-number of all; nothing where they are not known, None where all
-    parts have the same."""
-    exposed = [[part.metadata.get(key, usual) for key, usual in _EXPOSURE.items()] for part in parts]
-    lacking = [part.path.name for part in parts if "f_number" not in part.metadata]
-    without = [part.path.name for part in parts if "gain" not in part.metadata]
-    is_exposed = any(time is not None for time, *_ in exposed)
+def _exposure_of_bands(parts: Sequence[Cube], warnings: list[str]) -> Exposure:
+    """That of all parts where they have the same; otherwise time times gain of each band, with the f-number of all, or
+    nothing where they are not known."""
+    each = [part.exposure for part in parts]
+    times: list[tuple[float, ...]] = [() if one.time is None else one.time.numbers for one in each]
+    gains = [(1.0,) if one.gain is None else one.gain.numbers for one in each]
+    f_numbers = [one.f_number or 1.0 for one in each]
+    lacking = [part.path.name for part in parts if part.exposure.f_number is None]
+    without = [part.path.name for part in parts if part.exposure.gain is None]
+    is_exposed = any(times)
     has_gains = is_exposed and 0 < len(without) < len(parts)
-    if has_gains and any(gain != 1.0 for _, gain, _ in exposed):
+    if has_gains and any(gain != (1.0,) for gain in gains):
         unknown = f"the gain is known of some bands and not of {name_some(without)}"
         warnings.append(f"{unknown}: exposures are not compared; write it into all files, or none")
-        return {}
+        return Exposure()
     is_partial = is_exposed and 0 < len(lacking) < len(parts)
     if is_partial:
-        exposed = [[time, gain, 1.0] for time, gain, _ in exposed]
-    is_same = len(set(map(repr, exposed))) == 1
-    if not is_same and not all(isinstance(number, float) for numbers in exposed for number in numbers):
+        f_numbers = [1.0] * len(parts)
+    is_same = len({*zip(times, gains, f_numbers, strict=True)}) == 1
+    if not is_same and not all(len(numbers) == 1 for numbers in (*times, *gains)):
         unknown = "one exposure time and gain is not known of every band: exposures are not compared"
         warnings += [unknown] if is_exposed else []
-        return {}
+        return Exposure()
     if has_gains:
         taken = (
             f"the gain is 1 in some bands and not known of {name_some(without)}, where it is taken for 1, too"
@@ -184,8 +200,12 @@ def _exposure_of_bands(parts: Sequence[SpectralFile], warnings: list[str]) -> di
         warnings.append(f"{taken}: values may be off by a factor")
     unknown = f"the f-number of the lens is known of some bands and not of {name_some(lacking)}"
     warnings += [f"{unknown}: exposures are compared without it"] if is_partial else []
+    f_number = None if lacking else f_numbers[0]
     if is_same:
-        return None
-    of_first = exposed[0][2]  # so that the bands have one f-number again
-    times_s = [time * gain * (of_first / own) ** 2 for time, gain, own in exposed]
-    return {"exposure_s": times_s} | ({} if lacking else {"f_number": of_first})
+        return Exposure(each[0].time, None if without else each[0].gain, f_number)
+    # As if all bands had the f-number of the first.
+    seconds = [
+        time[0] * gain[0] * (f_numbers[0] / own) ** 2
+        for time, gain, own in zip(times, gains, f_numbers, strict=True)
+    ]
+    return Exposure(Factor(tuple(seconds)), None, f_number)

@@ -18,6 +18,11 @@ from typing import Any, BinaryIO, Literal
 
 import numpy as np
 
+from unmix_plugin.captures.cube import (
+    Cube,
+    ReadOptions,
+    import_extra,
+)
 from unmix_plugin.captures.numbers import Block, Decoded, Held, Mapped
 from unmix_plugin.captures.readers.arrays import (
     UNREAD,
@@ -25,11 +30,6 @@ from unmix_plugin.captures.readers.arrays import (
     FoundArray,
     describes_image,
     image_of_arrays,
-)
-from unmix_plugin.captures.spectral_file import (
-    ReadOptions,
-    SpectralFile,
-    import_extra,
 )
 from unmix_plugin.errors import CaptureError, counted
 from unmix_plugin.limits import (
@@ -49,7 +49,7 @@ from unmix_plugin.scenes.reading.cubes import (
 # NumPy: .npy is mapped, of .npz the member that is an image is loaded. No pickle is ever read.
 
 
-def open_container(kind: str, path: Path, options: ReadOptions) -> SpectralFile:
+def open_container(kind: str, path: Path, options: ReadOptions) -> Cube:
     """Open the image of a file of one of `KINDS`, by its headers. Raises CaptureError: the file is damaged or cut
     short, holds objects, or no array of it, or more than one, can be the image."""
     reader, list_arrays = KINDS[kind]
@@ -139,7 +139,7 @@ _BARE_AXIS = "This is a netCDF dimension but not a netCDF variable"
 """What begins the attribute NAME of data sets that hold nothing. Source: netCDF-C, DIM_WITHOUT_VARIABLE."""
 
 
-def open_hdf5(path: Path, options: ReadOptions) -> SpectralFile:
+def open_hdf5(path: Path, options: ReadOptions) -> Cube:
     """Open the data set that is the image; MATLAB's have their axes in reverse order, which is undone. Raises
     CaptureError: the file is damaged, or no data set, or more than one, can be the image."""
     h5py = import_extra("h5py")
@@ -169,7 +169,7 @@ def open_hdf5(path: Path, options: ReadOptions) -> SpectralFile:
     with h5py.File(path, "r") as file:
         visit(file, "", {})
     opened = image_of_arrays(path, "matlab" if is_matlab else "hdf5", arrays, options)
-    name = opened.metadata.get("dataset") or arrays[0].name
+    name = opened.dataset or arrays[0].name
     with h5py.File(path, "r") as file:
         image = file[name]
         if image.external or image.is_virtual:
@@ -179,7 +179,7 @@ def open_hdf5(path: Path, options: ReadOptions) -> SpectralFile:
         return _with_fill(opened, image)
 
 
-def _with_fill(opened: SpectralFile, image: Any) -> SpectralFile:
+def _with_fill(opened: Cube, image: Any) -> Cube:
     """The image with the number that its data set has where nothing was written, if chunks of it are lacking."""
     if image.chunks:
         grid = [-(-length // step) for length, step in zip(image.shape, image.chunks, strict=True)]

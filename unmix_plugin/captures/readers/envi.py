@@ -6,16 +6,16 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
+from unmix_plugin.captures.cube import Cube, Exposure, ReadOptions
 from unmix_plugin.captures.fields import (
     Format,
     check_bands,
-    exposure_facts,
     listed,
     state_bands,
+    state_exposure,
     state_linear,
 )
 from unmix_plugin.captures.numbers import Mapped, Numbers
-from unmix_plugin.captures.spectral_file import ReadOptions, SpectralFile
 from unmix_plugin.errors import CaptureError, counted
 from unmix_plugin.formats.envi import (
     MAP_KEYS,
@@ -29,7 +29,9 @@ from unmix_plugin.formats.envi import (
 )
 
 _SHOWN_LENGTH = 200
-"""Longer entries of a header are lists, which are not kept as metadata."""
+"""Longer entries of a header are lists, which are not kept for people."""
+_FACTOR = "reflectance scale factor"
+"""Says that values are reflectances, also where it is 1 and changes nothing."""
 _DESCRIBED = (".tif", ".tiff", ".exr", ".npy", ".h5", ".hdf5", ".he5", ".nc", ".mat")
 """Images that a header may describe instead of plain numbers."""
 _COMPRESSED = {b"\x1f\x8b": "gzip", b"BZh": "bzip2", b"PK\x03\x04": "zip", b"\xfd7zXZ": "xz"}
@@ -53,7 +55,7 @@ def is_envi_header(path: Path) -> bool:
         return header_begins(file.read(32))
 
 
-def open_envi(path: Path, _: ReadOptions) -> SpectralFile:
+def open_envi(path: Path, _: ReadOptions) -> Cube:
     """Open an image by its header, or by the file of numbers beside it."""
     is_header = path.suffix.lower() == ".hdr" or is_envi_header(path)
     header_path = path if is_header else header_beside(path)
@@ -71,7 +73,7 @@ def open_envi(path: Path, _: ReadOptions) -> SpectralFile:
     lengths = dict(zip("yxb", layout.shape, strict=True))
     stored = tuple(lengths[axis] for axis in layout.axes)
     numbers = Mapped(data_path, layout.dtype, stored, layout.offset)
-    plain = SpectralFile(
+    plain = Cube(
         path=header_path,
         reader="envi",
         shape=layout.shape,
@@ -84,7 +86,7 @@ def open_envi(path: Path, _: ReadOptions) -> SpectralFile:
     return _described(plain, header_path, header)
 
 
-def described_by_header(file: SpectralFile) -> SpectralFile:
+def described_by_header(file: Cube) -> Cube:
     """An image of another format with what an ENVI header beside it says; unchanged where there is none.
 
     Programs write such headers beside TIFF files to keep wavelengths and gains, often with `file type = TIFF`. Raises
@@ -124,7 +126,7 @@ def described_image(header_path: Path) -> Path | None:
     return others[0]
 
 
-def _described(file: SpectralFile, header_path: Path, header: dict[str, str]) -> SpectralFile:
+def _described(file: Cube, header_path: Path, header: dict[str, str]) -> Cube:
     """The file with bands, gains, exposure and other facts of a header; what the file says itself fills gaps."""
     num_bands, own, warnings = file.shape[2], file.bands, list(file.warnings)
     if unread := header.pop("", "").splitlines():
@@ -136,14 +138,15 @@ def _described(file: SpectralFile, header_path: Path, header: dict[str, str]) ->
     if bands.wavelengths_nm is None and own.wavelengths_nm is not None:
         bands = replace(own, bad=own.bad if bands.bad is None else bands.bad)
     linear = state_linear(header_path, num_bands, header, "header field", Format.ENVI, warnings)
-    factors = [key for key in header if key.endswith("scale factor") and key != "reflectance scale factor"]
+    factors = [key for key in header if key.endswith("scale factor") and key != _FACTOR]
     factors = [key for key in factors if header[key].strip("{} ") not in ("1", "1.0")]
     warnings += [f"'{key}' is {header[key]}: not applied, as ENVI knows no such field" for key in factors]
     # Of Resonon, which writes decibels without saying so. Source: massipipe, RadianceConverter.
     in_db = header.keys() >= _OF_RESONON and "gain unit" not in header
-    exposure = exposure_facts(header | ({"gain unit": "dB"} if in_db else {}), "header field", warnings)
-    if in_db and "gain_evidence" in exposure:
-        exposure["gain_evidence"] += ", taken as decibels, as Resonon writes"
+    exposure = state_exposure(header | ({"gain unit": "dB"} if in_db else {}), "header field", warnings)
+    if in_db and exposure.gain is not None:
+        source = f"{exposure.gain.source}, taken as decibels, as Resonon writes"
+        exposure = replace(exposure, gain=replace(exposure.gain, source=source))
     start, lines = (
         _numbers(header, _DARK_START, "dark lines may be left in the image", warnings),
         file.shape[0],
@@ -163,7 +166,14 @@ def _described(file: SpectralFile, header_path: Path, header: dict[str, str]) ->
         linear=linear or file.linear,
         no_data=tuple(dict.fromkeys((*no_data, *file.no_data))),
         warnings=tuple(warnings),
-        metadata=file.metadata | exposure | ({"map": on_map} if on_map else {}) | {"header": shown},
+        exposure=Exposure(
+            exposure.time or file.exposure.time,
+            exposure.gain or file.exposure.gain,
+            exposure.f_number or file.exposure.f_number,
+        ),
+        reflectance_source="header field 'reflectance scale factor'" if _FACTOR in header else "",
+        map_entries=on_map,
+        others={**file.others, "header": shown},
     )
 
 

@@ -26,10 +26,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int
 
-from unmix_plugin.captures.fields import exposure_facts
+from unmix_plugin.captures.cube import BandTable, Cube, Exposure, Factor, ReadOptions
+from unmix_plugin.captures.fields import state_exposure
 from unmix_plugin.captures.names import natural_order
 from unmix_plugin.captures.numbers import Decoded, Numbers
-from unmix_plugin.captures.spectral_file import BandTable, ReadOptions, SpectralFile
 from unmix_plugin.captures.wavelengths import PLAUSIBLE_NM, wavelengths_in_names
 from unmix_plugin.errors import CaptureError, name_some
 from unmix_plugin.limits import allow_decoded, allow_parts
@@ -73,7 +73,7 @@ class _SpectralChannel:
     width_nm: float | None
 
 
-def open_exr(path: Path, options: ReadOptions) -> SpectralFile:
+def open_exr(path: Path, options: ReadOptions) -> Cube:
     """Open an image by its header; the numbers are read as a whole, when the first of them is asked for.
 
     `options.dataset` names a layer (`S0`, `T`), a part, or one channel. Raises CaptureError: the file is damaged, or
@@ -116,12 +116,13 @@ def open_exr(path: Path, options: ReadOptions) -> SpectralFile:
         for name, value in header.items()
         if isinstance(value, str | int | float) and name not in _OF_ALL_FILES
     }
-    exposure = exposure_facts(attributes, "attribute", warnings)
+    exposure = state_exposure(attributes, "attribute", warnings)
     speed, aperture = (attributes.get(key) for key in ("isoSpeed", "aperture"))
-    if exposure and isinstance(speed, float) and 0 < speed < np.inf:
-        exposure |= {"gain": speed / 100, "gain_evidence": "attribute 'isoSpeed'"}
-    if exposure and isinstance(aperture, float) and 0 < aperture < np.inf:
-        exposure["f_number"] = aperture
+    if exposure != Exposure():
+        if isinstance(speed, float) and 0 < speed < np.inf:
+            exposure = replace(exposure, gain=Factor((speed / 100,), "attribute 'isoSpeed'"))
+        if isinstance(aperture, float) and 0 < aperture < np.inf:
+            exposure = replace(exposure, f_number=aperture)
     counts = Counter(channel.part for channel in channels)
     listed = [
         {"name": title, "type": str(part.type()), "channels": counts[index]}
@@ -131,7 +132,7 @@ def open_exr(path: Path, options: ReadOptions) -> SpectralFile:
     dtype = np.result_type(dtype, np.float16) if is_partial else dtype
     height, width = (frame[1] - frame[0])[::-1].tolist()
     planes = len(chosen), height, width
-    return SpectralFile(
+    return Cube(
         path=path,
         reader="exr",
         shape=(height, width, len(chosen)),
@@ -140,8 +141,9 @@ def open_exr(path: Path, options: ReadOptions) -> SpectralFile:
         bands=table,
         notes=("the data window is a part of the picture: pixels outside are missing",) if is_partial else (),
         warnings=tuple(warnings),
-        metadata=attributes
-        | exposure
+        exposure=exposure,
+        reflectance_source="the layer T" if (table.names or ("",))[0].startswith("T.") else "",
+        others=attributes
         | ({"other_channels": others} if others else {})
         | ({"parts": listed} if len(parts) > 1 else {}),
     )

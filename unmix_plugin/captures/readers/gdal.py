@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any, TypeAlias
 from xml.etree.ElementTree import Element
 
+from unmix_plugin.captures.cube import Cube, Linear, Meaning
 from unmix_plugin.captures.fields import Format, check_bands, plain_names, state_bands, state_linear
-from unmix_plugin.captures.spectral_file import Linear, SpectralFile
 from unmix_plugin.errors import counted
 from unmix_plugin.limits import parse_xml, read_bounded
 
@@ -23,8 +23,8 @@ _NAMES_BY_ROLE = {"scale": "scale", "offset": "offset", "description": "band_nam
 """What entries are that GDAL itself marks with a role."""
 _IMAGE_NAME = re.compile(r"SPECTRAL_IMAGE(_VNIR|_SWIR)?$")
 """End of the name of an image of EnMAP or DESIS; those of EnMAP's level L1B have the bands of one detector."""
-_QUANTITIES = {"L1B": "radiance", "L1C": "radiance", "L2A": "reflectance"}
-_LEVEL = re.compile(rf"(?<![A-Z])({'|'.join(_QUANTITIES)})(?![A-Z0-9])")
+_MEANINGS = {"L1B": Meaning.RADIANCE, "L1C": Meaning.RADIANCE, "L2A": Meaning.REFLECTANCE}
+_LEVEL = re.compile(rf"(?<![A-Z])({'|'.join(_MEANINGS)})(?![A-Z0-9])")
 """Of EnMAP and DESIS, as their XML or their names say it: ENMAP01-____L2A-..., DESIS-HSI-L2A-..."""
 _OF_BANDS = {
     "scale": ("Scale", "GainOfBand", "gainOfBand"),
@@ -91,7 +91,7 @@ def gdal_number(text: str) -> float | None:
     return number if not math.isinf(number) else None
 
 
-def with_xml_beside(file: SpectralFile) -> SpectralFile:
+def with_xml_beside(file: Cube) -> Cube:
     """The file with what an XML beside it says of its bands, where it says nothing itself.
 
     GDAL keeps gains, offsets and the no-data value in NAME.aux.xml; NAME-SPECTRAL_IMAGE.TIF of EnMAP and DESIS has
@@ -114,13 +114,13 @@ def with_xml_beside(file: SpectralFile) -> SpectralFile:
     return file
 
 
-def _with_xml(file: SpectralFile, found: Path, warnings: list[str]) -> SpectralFile:
+def _with_xml(file: Cube, found: Path, warnings: list[str]) -> Cube:
     try:
         root = parse_xml(read_bounded(found))
     except ValueError:
         warnings.append(f"{found.name} is damaged: what it says is not used")
         return file
-    num_bands, first, quantity = file.shape[2], 1, None
+    num_bands, first, meaning = file.shape[2], 1, None
     elements = list(root.iter("PAMRasterBand"))
     if not found.name.endswith(".aux.xml"):
         places = (".//bandCharacterisation/bandID", ".//bandCharacterisation/band")
@@ -132,7 +132,7 @@ def _with_xml(file: SpectralFile, found: Path, warnings: list[str]) -> SpectralF
             return file
         first = 1 + len(elements) - num_bands if detector == "_SWIR" else 1
         level = _LEVEL.search(root.findtext("base/level") or found.stem)
-        quantity = level and _QUANTITIES[level[1]]
+        meaning = level and _MEANINGS[level[1]]
     items = _items_of_bands(elements, first, num_bands)
     bands, of_all = file.bands, {name: texts for name, texts in items.items() if len(texts) == num_bands}
     unit = {} if found.name.endswith(".aux.xml") else {"wavelength_units": "nm"}
@@ -141,8 +141,8 @@ def _with_xml(file: SpectralFile, found: Path, warnings: list[str]) -> SpectralF
         table = check_bands(stated, num_bands, warnings).marking(bands.bad)
         bands = replace(table, names=table.names if bands.names is None else bands.names)
     linear = file.linear or gdal_linear(file.path, items, num_bands, found.name, warnings)
-    if linear is not None and quantity:
-        linear = replace(linear, evidence=f"{linear.evidence} of {quantity}")
+    if linear is not None and meaning:
+        linear = replace(linear, source=f"{linear.source} of {meaning.value}", meaning=meaning)
     texts = items.get("no_data", {}).values()
     no_data = [number for number in map(gdal_number, texts) if number is not None and not math.isnan(number)]
     return replace(

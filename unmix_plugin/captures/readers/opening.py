@@ -14,6 +14,12 @@ from typing import Any
 
 import numpy as np
 
+from unmix_plugin.captures.cube import (
+    Cube,
+    ReadOptions,
+    unreadable,
+    with_mask,
+)
 from unmix_plugin.captures.readers.band_files import open_band_folder
 from unmix_plugin.captures.readers.containers import KINDS, open_container, open_hdf5
 from unmix_plugin.captures.readers.envi import (
@@ -26,13 +32,6 @@ from unmix_plugin.captures.readers.exr import open_exr
 from unmix_plugin.captures.readers.gdal import with_xml_beside
 from unmix_plugin.captures.readers.pictures import open_picture
 from unmix_plugin.captures.readers.tiff import open_tiff
-from unmix_plugin.captures.spectral_file import (
-    GIVEN,
-    ReadOptions,
-    SpectralFile,
-    unreadable,
-    with_mask,
-)
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.formats.envi import header_beside
 from unmix_plugin.limits import open_regular, open_zip
@@ -84,7 +83,7 @@ _LLFF_COLUMNS = 17
 _POSE_SUFFIXES = (".json", ".xml", ".bin", ".txt")
 
 
-def open_spectral_file(path: Path, options: ReadOptions | None = None) -> SpectralFile:
+def open_spectral_file(path: Path, options: ReadOptions | None = None) -> Cube:
     """Open a file, or a folder that holds one picture a band, without reading its numbers.
 
     Args:
@@ -113,7 +112,7 @@ def open_spectral_file(path: Path, options: ReadOptions | None = None) -> Spectr
             return opened
         if len(given) != num_bands:
             raise CaptureError(f"{opened.path}: {len(given)} wavelengths were given for {size}")
-        bands = replace(opened.bands, wavelengths_nm=given, evidence=GIVEN)
+        bands = replace(opened.bands, wavelengths_nm=given, evidence="given by the user", is_given=True)
         return replace(opened, bands=bands)
     except CaptureError:
         raise
@@ -121,7 +120,7 @@ def open_spectral_file(path: Path, options: ReadOptions | None = None) -> Spectr
         raise unreadable(path, error) from error
 
 
-def _opened(path: Path, options: ReadOptions) -> SpectralFile:
+def _opened(path: Path, options: ReadOptions) -> Cube:
     """The file by its reader, with what lies beside it: an ENVI header, an XML of GDAL or EnMAP, a mask of GDAL."""
     kind = _file_kind(path)
     described = described_image(path) if kind == "envi" and path.suffix.lower() == ".hdr" else None
@@ -133,7 +132,7 @@ def _opened(path: Path, options: ReadOptions) -> SpectralFile:
     return _with_mask_beside(with_xml_beside(opened if kind == "envi" else described_by_header(opened)))
 
 
-def _with_mask_beside(file: SpectralFile) -> SpectralFile:
+def _with_mask_beside(file: Cube) -> Cube:
     """The file with GDAL's mask NAME.msk, of one band or as many as the file, where there is one.
 
     Source: GDAL, RFC 15: band masks.
@@ -232,7 +231,7 @@ def inspect_file(path: Path, options: ReadOptions | None = None) -> dict[str, An
             "offsets": linear and linear.offsets.tolist(),
             "no_data": _plain(opened.no_data[0] if len(opened.no_data) == 1 else opened.no_data or None),
             "notes": [*opened.warnings, *opened.notes],
-            "metadata": _plain(opened.metadata),
+            "metadata": _plain(opened.facts),
         }
     if opened is None or (path.suffix.lower() == ".npy" and opened.shape[1:] == (_LLFF_COLUMNS, 1)):
         facts |= _poses_of(path, refused)
@@ -272,7 +271,7 @@ def _plain(value: Any) -> Any:
     return text if len(text) <= _LONGEST_TEXT else f"{text[:_LONGEST_TEXT]}..."
 
 
-_READERS: dict[str, Callable[[Path, ReadOptions], SpectralFile]] = {
+_READERS: dict[str, Callable[[Path, ReadOptions], Cube]] = {
     **{kind: partial(open_container, kind) for kind in KINDS},
     "hdf5": open_hdf5,
     "envi": open_envi,

@@ -1,25 +1,25 @@
 """PNG and JPEG pictures: one band, or red, green and blue.
 
-Numbers are as they are stored: what is gamma-encoded stays so, and `metadata["encoding"]` says it.
+Numbers are as they are stored: what is gamma-encoded stays so, and `Cube.is_srgb` says it.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from unmix_plugin.captures.camera_tags import parse_xmp, with_camera_tags
-from unmix_plugin.captures.fields import exposure_facts
-from unmix_plugin.captures.numbers import Decoded, Numbers
-from unmix_plugin.captures.spectral_file import (
+from unmix_plugin.captures.cube import (
     COLOURS_AS_STORED,
     BandTable,
+    CameraTags,
+    Cube,
     ReadOptions,
-    SpectralFile,
     import_extra,
 )
+from unmix_plugin.captures.fields import state_exposure
+from unmix_plugin.captures.numbers import Decoded, Numbers
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.limits import allow_decoded
 
@@ -35,7 +35,7 @@ _EXIF_DIRECTORY = 0x8769
 _EXPOSURE = {0x829A: "EXIF ExposureTime", 0x8827: "EXIF ISOSpeedRatings", 0x829D: "EXIF FNumber"}
 
 
-def open_picture(path: Path, _: ReadOptions) -> SpectralFile:
+def open_picture(path: Path, _: ReadOptions) -> Cube:
     """Open a picture by its header; it is decoded when its first numbers are asked for. Raises CaptureError: it is
     damaged, or of a kind that has neither one band nor three."""
     from PIL import Image
@@ -57,18 +57,11 @@ def open_picture(path: Path, _: ReadOptions) -> SpectralFile:
     xmp = parse_xmp(info.get("xmp") or b"")
     colours = BandTable(names=("red", "green", "blue") if num_bands == 3 else None)
     bands = with_camera_tags(colours, xmp, num_bands)
-    metadata: dict[str, Any] = {"xmp": xmp} if xmp else {}
-    if num_bands == 3 and dtype.itemsize == 1 and bands.wavelengths_nm is None:
-        metadata["encoding"] = "sRGB"
-    if orientation in range(2, 9):
-        metadata["orientation"] = orientation
     warnings = [COLOURS_AS_STORED] if deep == 3 and bands.wavelengths_nm is None else []
     exposed = {name: taken[code] for code, name in _EXPOSURE.items() if code in taken}
-    metadata |= exposure_facts(exposed, "tag", warnings)
-    if alpha:
-        metadata["has_alpha"] = True
+    exposure = state_exposure(exposed, "tag", warnings)
     size = height, width, num_bands
-    return SpectralFile(
+    return Cube(
         path=path,
         reader="picture",
         shape=size,
@@ -78,7 +71,11 @@ def open_picture(path: Path, _: ReadOptions) -> SpectralFile:
         interleave="bip" if num_bands == 3 else None,
         notes=("the picture has opacity, which is not a band and is left out",) if alpha else (),
         warnings=tuple(warnings),
-        metadata=metadata,
+        exposure=exposure,
+        camera=CameraTags(xmp),
+        is_srgb=num_bands == 3 and dtype.itemsize == 1 and bands.wavelengths_nm is None,
+        orientation=orientation if orientation in range(1, 9) else 1,
+        others={"has_alpha": True} if alpha else {},
     )
 
 

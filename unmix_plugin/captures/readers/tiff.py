@@ -23,17 +23,17 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 
 from unmix_plugin.captures.camera_tags import camera_tags, with_camera_tags
-from unmix_plugin.captures.fields import StatedBands, check_bands, exposure_facts, state_bands
-from unmix_plugin.captures.numbers import Axes, Block, Decoded, Mapped, Numbers
-from unmix_plugin.captures.readers.arrays import choose_axes, image_shape
-from unmix_plugin.captures.readers.gdal import gdal_entries, gdal_items, gdal_linear, gdal_number
-from unmix_plugin.captures.spectral_file import (
+from unmix_plugin.captures.cube import (
     COLOURS_AS_STORED,
+    Cube,
     ReadOptions,
-    SpectralFile,
     import_extra,
     with_mask,
 )
+from unmix_plugin.captures.fields import StatedBands, check_bands, state_bands, state_exposure
+from unmix_plugin.captures.numbers import Axes, Block, Decoded, Mapped, Numbers
+from unmix_plugin.captures.readers.arrays import choose_axes, image_shape
+from unmix_plugin.captures.readers.gdal import gdal_entries, gdal_items, gdal_linear, gdal_number
 from unmix_plugin.errors import CaptureError, counted
 from unmix_plugin.limits import MOST_BANDS, allow_decoded, allow_parts, refuse
 from unmix_plugin.spectral.bands import nm_per_unit
@@ -110,7 +110,7 @@ class _Stack:
         return Numbers(blocks, shape, axes, self.dtype)
 
 
-def open_tiff(path: Path, options: ReadOptions) -> SpectralFile:
+def open_tiff(path: Path, options: ReadOptions) -> Cube:
     """Open an image whose bands are pages, planes or samples. Raises CaptureError: pages contradict each other, or the
     file is cut short."""
     _check_directories(path)
@@ -147,29 +147,30 @@ def open_tiff(path: Path, options: ReadOptions) -> SpectralFile:
     allow_parts(path, shape[2], "bands", CaptureError, MOST_BANDS)
     bands = check_bands(stated, shape[2], warnings)
     linear = gdal_linear(path, items, shape[2], "GDAL's", warnings)
-    applied = "" if linear is None else linear.evidence
-    exposed = {f"EXIF {name}": value for name, value in tags["exif"].items()}
-    exposed |= {name: value for name, value in entries.items() if f"'{name}'" not in applied}
-    exposure = exposure_facts(exposed, "tag or metadata", warnings)
+    applied = () if linear is None else linear.entries
+    exposed = {f"EXIF {name}": value for name, value in tags.exif.items()}
+    exposed |= {name: value for name, value in entries.items() if name not in applied}
+    exposure = state_exposure(exposed, "tag or metadata", warnings)
+    turned: Any = tags.exif.get("Orientation")
     # A picture is as bright as its numbers to the eye only.
     is_colour = first.photometric in _COLOURS and bands.wavelengths_nm is None
     warnings += [COLOURS_AS_STORED] if is_colour and first.dtype in (np.uint8, np.uint16) else []
-    opened = SpectralFile(
+    opened = Cube(
         path=path,
         reader="tiff",
         shape=shape,
         dtype=stack.dtype,
         numbers=stack.numbers(path, axes),
-        bands=with_camera_tags(bands, tags["xmp"], shape[2]),
+        bands=with_camera_tags(bands, tags.xmp, shape[2]),
         interleave=interleave,
         linear=linear,
         no_data=stack.no_data,
         notes=tuple(text for text in messages if "GDAL_NODATA" not in text)[:3],
         warnings=tuple(warnings),
-        metadata={name: value for name, value in tags.items() if value}
-        | exposure
-        | ({"orientation": turned} if (turned := tags["exif"].get("Orientation")) in range(2, 9) else {})
-        | ({"geo_reference": "GeoTIFF"} if on_map else {}),
+        exposure=exposure,
+        camera=tags,
+        orientation=int(turned) if turned in range(1, 9) else 1,
+        is_geotiff=on_map,
     )
     for page in masks:
         opened = _with_mask_page(opened, page)
@@ -323,7 +324,7 @@ def _mask_pages(path: Path, file: TiffFile, image: TiffPage) -> list[TiffPage]:
     return masks
 
 
-def _with_mask_page(opened: SpectralFile, page: TiffPage) -> SpectralFile:
+def _with_mask_page(opened: Cube, page: TiffPage) -> Cube:
     if opened.shape[:2] != page.shaped[2:4]:  # rows or columns are pages
         return opened
     stack = _Stack([page], (*opened.shape[:2], 1), np.dtype(page.dtype).newbyteorder(page.parent.byteorder))

@@ -20,13 +20,13 @@ from jaxtyping import Float64, UInt8
 from unmix_plugin import __version__
 from unmix_plugin.captures.calibration.sensor import Sensor
 from unmix_plugin.captures.checks import SeenView, angles_between, check_views
+from unmix_plugin.captures.cube import CaptureView
 from unmix_plugin.captures.match_checks import MatchedScene, check_matches
 from unmix_plugin.captures.options import ProcessOptions, plain_options
 from unmix_plugin.captures.plan import Plan, hashes
 from unmix_plugin.captures.poses.pose_set import PoseSet
 from unmix_plugin.captures.posing import PosedViews
 from unmix_plugin.captures.report import Kind, Remark, report_text, sentences
-from unmix_plugin.captures.spectral_file import CaptureView
 from unmix_plugin.captures.value_checks import ViewSample, check_files, check_values
 from unmix_plugin.captures.writing.view_files import FULL_SCALE, BackgroundRule, ViewRecord
 from unmix_plugin.engine.decisions import Decision

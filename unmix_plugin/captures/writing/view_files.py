@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8, UInt16
 
 from unmix_plugin.captures.calibration.calibration import CalibratedRows, Calibration, Raster
-from unmix_plugin.captures.spectral_file import CaptureView
+from unmix_plugin.captures.cube import CaptureView
 from unmix_plugin.captures.spoilt import sharpness_of
 from unmix_plugin.captures.writing.resampling import Resampling
 from unmix_plugin.engine.runs.atomic_files import whole_file, write_errors_as, write_file

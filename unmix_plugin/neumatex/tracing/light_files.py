@@ -100,9 +100,9 @@ def of_lamp(environment: Environment, lamp: Float[Tensor, "B"]) -> Environment:
 def read_exr(path: Path, channel: str | None = None) -> tuple[np.ndarray, list[str], np.ndarray | None]:
     """Numbers (H, W, C) of an OpenEXR picture, without alpha, or of one channel; names of the channels, and their
     wavelengths in nm if they are such. Raises CaptureError: the file is damaged, or of another kind."""
+    from unmix_plugin.captures.cube import ReadOptions
     from unmix_plugin.captures.readers.exr import channel_names
     from unmix_plugin.captures.readers.opening import open_spectral_file
-    from unmix_plugin.captures.spectral_file import ReadOptions
 
     channel_names(path)  # refuses other files
     file = open_spectral_file(path, ReadOptions(dataset=channel))

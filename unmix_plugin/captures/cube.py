@@ -1,17 +1,19 @@
-"""A file of an instrument, opened but not read: what it says of itself, and its numbers by rows and bands; and the
-views of a capture, which are made of such files.
+"""The cube of an instrument's file, opened but not read: its numbers, bands, meaning and exposure; and the views of a
+capture, which are made of cubes.
 
 Notation: `H` rows, `W` columns, `B` bands.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from enum import Enum
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Shaped
@@ -29,9 +31,8 @@ COLOURS_AS_STORED = (
 """Warning of colours that no header says to be linear."""
 MOST_WIDTH = 0.25
 """Width of a band, as a share of its wavelength, up to which one wavelength stands for it; panchromatic: 0.7."""
-GIVEN = "given by the user"
-"""Evidence of wavelengths that files do not state, or state wrongly."""
 _MEASURES_NOTHING = 1e30
+_REFLECTANCE = re.compile(r"(?<![a-z])reflectance(?![a-z])", re.IGNORECASE)
 _FLOAT32_EPS = float(np.finfo(np.float32).eps)
 
 
@@ -65,6 +66,8 @@ class BandTable:
     """Bands that the file itself marks as bad."""
     names: tuple[str, ...] | None = None
     """What the file calls its bands."""
+    is_given: bool = False
+    """Whether the user gives the wavelengths, which files do not state, or state wrongly."""
 
     def marking(self, *bad: Bool[np.ndarray, " B"] | None) -> BandTable:
         """The table in which these bands are bad too, where there are such marks."""
@@ -79,6 +82,16 @@ class BandTable:
         return self.fwhm_nm > MOST_WIDTH * self.wavelengths_nm
 
 
+class Meaning(Enum):
+    """What the values of a cube are once its gains and offsets are applied, as far as its file says."""
+
+    RAW = "stored numbers"
+    FRACTION = "numbers of which 1 means something, and nobody says what"
+    RADIANCE = "radiance"
+    REFLECTANCE = "reflectance"
+    SRGB = "brightness to the eye, gamma-encoded as sRGB"
+
+
 @dataclass(frozen=True)
 class Linear:
     """What the stored numbers of a file stand for: value = gain * stored + offset, band by band."""
@@ -86,8 +99,12 @@ class Linear:
     gains: Float64[np.ndarray, " B"]
     """Above 0."""
     offsets: Float64[np.ndarray, " B"]
-    evidence: str
+    source: str
     """Where the file says so, for people: `header field 'data gain values'`."""
+    meaning: Meaning = Meaning.FRACTION
+    """What values are."""
+    entries: tuple[str, ...] = ()
+    """Names of the entries that say so."""
 
     def apply(self, stored: np.ndarray, bands: BandIndex) -> Float32[np.ndarray, "h W b"]:
         """Values of some bands."""
@@ -102,35 +119,99 @@ class Linear:
 
 
 def linear_values(
-    path: Path, num_bands: int, gains: Sequence[float], offsets: Sequence[float], evidence: str
+    path: Path,
+    num_bands: int,
+    *,
+    gains: Sequence[float] = (),
+    offsets: Sequence[float] = (),
+    source: str,
+    meaning: Meaning = Meaning.FRACTION,
+    entries: tuple[str, ...] = (),
 ) -> Linear | None:
     """The calibration that a file states; None where it changes nothing.
 
     Args:
         gains, offsets: One a band, one for all, or none.
+        source, meaning, entries: As in `Linear`.
     Raises:
         CaptureError: another number of them, or gains that are not above 0: without them spectra would be false.
     """
     columns = []
     for name, numbers, usual in (("gains", gains, 1.0), ("offsets", offsets, 0.0)):
-        values = np.array(numbers or [usual], dtype=np.float64)
+        values = np.array(list(numbers) or [usual], dtype=np.float64)
         if len(values) not in (1, num_bands):
             raise CaptureError(
-                f"{path}: {evidence} gives {len(values)} {name} for {num_bands} bands; expected one a band, or one for "
+                f"{path}: {source} gives {len(values)} {name} for {num_bands} bands; expected one a band, or one for "
                 "all: correct them or take them out"
             )
         if not np.isfinite(values).all() or (name == "gains" and values.min() <= 0):
             raise CaptureError(
-                f"{path}: {evidence} gives {name} from {values.min():g} to {values.max():g}; expected finite numbers"
+                f"{path}: {source} gives {name} from {values.min():g} to {values.max():g}; expected finite numbers"
                 f"{' above 0' if name == 'gains' else ''}: correct them or take them out"
             )
         columns.append(np.broadcast_to(values, num_bands))
     changes = (columns[0] != 1).any() or columns[1].any()
-    return Linear(columns[0], columns[1], evidence) if changes else None
+    return Linear(columns[0], columns[1], source, meaning, entries) if changes else None
 
 
 @dataclass(frozen=True)
-class SpectralFile:
+class Factor:
+    """One factor of an exposure."""
+
+    numbers: tuple[float, ...]
+    """One, or one a band."""
+    source: str = ""
+    """Where the file says it, for people: `header field 'tint'`."""
+    assumed: str = ""
+    """Unit that numbers without one were taken to be in; empty where the file says it."""
+
+    @property
+    def number(self) -> float | list[float]:
+        """The only one, or the list."""
+        return self.numbers[0] if len(self.numbers) == 1 else list(self.numbers)
+
+    @property
+    def description(self) -> str:
+        """Source and unit, for people."""
+        return f"{self.source}, no unit: taken as {self.assumed}" if self.assumed else self.source
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """How long a file was exposed, as far as it says."""
+
+    time: Factor | None = None
+    """Seconds."""
+    gain: Factor | None = None
+    f_number: float | None = None
+    """Of the lens."""
+
+    def to_json(self) -> dict[str, Any]:
+        """For people."""
+        facts: dict[str, Any] = {}
+        for name, factor in (("exposure_s", self.time), ("gain", self.gain)):
+            if factor is not None:
+                facts[name] = factor.number
+                facts |= {f"{name.partition('_')[0]}_evidence": factor.description} if factor.source else {}
+        return facts if self.f_number is None else facts | {"f_number": self.f_number}
+
+
+XmpTags: TypeAlias = Mapping[str, str | list[str]]
+"""Text of each tag, or the texts of a list."""
+
+
+@dataclass(frozen=True)
+class CameraTags:
+    """What a camera writes beside its pixels."""
+
+    xmp: XmpTags = field(default_factory=dict)
+    """By full names, such as `Camera:BandName`."""
+    exif: Mapping[str, Any] = field(default_factory=dict)
+    """By tifffile's names; numbers, texts or lists of numbers."""
+
+
+@dataclass(frozen=True)
+class Cube:
     """One image of (H, W, B) numbers on disk."""
 
     path: Path
@@ -143,7 +224,7 @@ class SpectralFile:
     """Type of the stored numbers, in any byte order."""
     numbers: Numbers | None = field(default=None, repr=False)
     """Where the numbers lie, rows before and behind the image among them; None where they are those of `parts`."""
-    parts: tuple[SpectralFile, ...] = field(default=(), repr=False)
+    parts: tuple[Cube, ...] = field(default=(), repr=False)
     """Files that hold one band each, of which each says itself what is missing in it."""
     bands: BandTable = BandTable()
     interleave: str | None = None
@@ -158,8 +239,22 @@ class SpectralFile:
     """What is odd about the file, one sentence each."""
     warnings: tuple[str, ...] = ()
     """What may make values, wavelengths or geometry wrong, one sentence each: reports begin with it."""
-    metadata: dict[str, Any] = field(default_factory=dict)
-    """Other facts by name, as JSON-able values: exposure_s, gain, f_number, black_level, xmp, ..."""
+    exposure: Exposure = Exposure()
+    camera: CameraTags = CameraTags()
+    is_srgb: bool = False
+    """Whether numbers are gamma-encoded, as those of pictures for people are."""
+    reflectance_source: str = ""
+    """Where the file says that values are reflectances other than by gains: a layer, or a scale factor of 1."""
+    dataset: str = ""
+    """Name of the array in a file that holds several."""
+    orientation: int = 1
+    """EXIF's, 1 to 8, where 1 is not turned; it is never applied."""
+    map_entries: Mapping[str, str] = field(default_factory=dict)
+    """Entries of an ENVI header that place the image on a map."""
+    is_geotiff: bool = False
+    """Whether tags of a TIFF place it on a map."""
+    others: Mapping[str, Any] = field(default_factory=dict)
+    """Other entries of the file by name, JSON-able, for people alone: nothing is decided from them."""
     sources: tuple[Path, ...] = ()
     """Files that hold the numbers, where they are not `path` alone."""
     first_line: int = 0
@@ -206,7 +301,44 @@ class SpectralFile:
         return np.concatenate([part.read(rows) for part in parts], axis=-1)
 
     @property
-    def dark(self) -> SpectralFile | None:
+    def meaning(self) -> Meaning:
+        """What values are, as far as the file says by its entries. Whether a camera's own calibration makes radiance of
+        them, `radiometric_model` tells."""
+        linear = Meaning.RAW if self.linear is None else self.linear.meaning
+        if self.is_srgb:
+            return Meaning.SRGB
+        if self.reflectance_source or linear is Meaning.REFLECTANCE:
+            return Meaning.REFLECTANCE
+        return Meaning.FRACTION if linear is Meaning.RAW and self.dtype.kind == "f" else linear
+
+    @property
+    def meaning_source(self) -> str:
+        """Where the file says so, for people; empty where it doesn't."""
+        return self.reflectance_source or ("" if self.linear is None else self.linear.source)
+
+    @property
+    def reflectance_name(self) -> str:
+        """The name of the file or of its array, where it has the word reflectance (REFLECTANCE_212, site/reflectance);
+        empty for raw numbers, which whole ones without a gain are whatever their name (reflectance_target)."""
+        if self.dtype.kind != "f" and self.linear is None:
+            return ""
+        return next((name for name in (self.path.stem, self.dataset) if _REFLECTANCE.search(name)), "")
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """All that the file says beside its bands and numbers, JSON-able, for people."""
+        facts = {**self.others, **self.exposure.to_json()}
+        facts |= {
+            name: value for name, value in (("xmp", self.camera.xmp), ("exif", self.camera.exif)) if value
+        }
+        facts |= {"encoding": "sRGB"} if self.is_srgb else {}
+        facts |= {"dataset": self.dataset} if self.dataset else {}
+        facts |= {"orientation": self.orientation} if self.orientation != 1 else {}
+        facts |= {"map": dict(self.map_entries)} if self.map_entries else {}
+        return facts | ({"geo_reference": "GeoTIFF"} if self.is_geotiff else {})
+
+    @property
+    def dark(self) -> Cube | None:
         """The lines that were taken with the shutter closed, as a dark frame; None where there are none."""
         if not self.dark_lines:
             return None
@@ -220,7 +352,7 @@ class SpectralFile:
 
 
 def find_missing(
-    stored: np.ndarray, file: SpectralFile, rows: slice = slice(None), bands: BandIndex = slice(None)
+    stored: np.ndarray, file: Cube, rows: slice = slice(None), bands: BandIndex = slice(None)
 ) -> Bool[np.ndarray, "h W"]:
     """Pixels without a measurement: no number in some band, a no-data value of the file, out of its valid range, or
     missing by a mask of the file.
@@ -247,7 +379,7 @@ def find_missing(
     return missing
 
 
-def with_mask(file: SpectralFile, name: str, mask: Numbers) -> SpectralFile:
+def with_mask(file: Cube, name: str, mask: Numbers) -> Cube:
     """The file with pixels missing where a mask, called `name` in notes, is 0 in one of the bands that are asked for.
 
     Source: GDAL, RFC 15: band masks: 0 is no data.
@@ -297,7 +429,7 @@ class CaptureView:
 
     name: str
     """Unique in the capture, fit for file names; poses are found by it or by the stem of one of the files."""
-    cube: SpectralFile
+    cube: Cube
     """All bands that were taken from this place."""
     sensor: str = ""
     """Lens or camera of a rig that took it; views of one sensor share bands and size."""
@@ -307,12 +439,12 @@ class CaptureView:
     """Black where pixels are ignored."""
     labels: Path | None = None
     """True materials, if known."""
-    dark: SpectralFile | None = None
-    white: SpectralFile | None = None
+    dark: Cube | None = None
+    white: Cube | None = None
     """References that were taken for this view alone."""
-    white_dark: SpectralFile | None = None
+    white_dark: Cube | None = None
     """Dark frame that was taken for its white reference alone, with the exposure of that."""
-    alpha: SpectralFile | None = None
+    alpha: Cube | None = None
     """Opacity in [0, 1], (H, W, 1), where it is not a channel of the picture; the cube is multiplied by it."""
     lens: Lens | None = None
     """Intrinsics that the camera itself writes; poses may bring better ones."""
@@ -322,7 +454,7 @@ class CaptureView:
     """What the layout says the view is for."""
 
     @property
-    def references(self) -> list[SpectralFile]:
+    def references(self) -> list[Cube]:
         """The files of all references of its own."""
         return [file for file in (self.dark, self.white, self.white_dark) if file is not None]
 
