@@ -408,18 +408,19 @@ def test_a_scene_may_be_written_to_the_working_directory_but_not_to_the_root(tmp
         ("450,\n460,\n", [450, 460]),
         ("450,460,470\n", [450, 460, 470]),
         ("wavelength,width\n450,5\n460,5\n", [450, 460]),
-        ("450,5\n460,5\n", "the line '450,5' has 2 cells; expected one number with a decimal point"),
-        ("wavelength\n450,5\n460,5\n", "the line '450,5' has 2 cells; expected 1, as in the header"),
+        ("wavelength\n450,5\n460,5\n", [450.5, 460.5]),
+        ("band;wavelength [\u00b5m];name\n1;0,45;blue\n2;0,55;green\n", [450, 550]),
+        ("450,5\n460,5\n", "can be read in two ways: 450 and 5 with .* or 450.5 with"),
+        ("1 450\n2 460\n", "the line '1 450' has 2 cells; expected one number a line"),
     ],
 )
 def test_a_file_of_wavelengths_has_one_a_line_or_a_header(tmp_path: Path, text, nm):
-    """A decimal comma would part a wavelength in two cells."""
     (tmp_path / "nm.csv").write_text(text)
     if isinstance(nm, str):
         with pytest.raises(ConfigError, match=nm):
             parse_wavelengths(str(tmp_path / "nm.csv"))
     else:
-        assert parse_wavelengths(str(tmp_path / "nm.csv")).tolist() == nm
+        np.testing.assert_allclose(parse_wavelengths(str(tmp_path / "nm.csv")), nm)
 
 
 NAMES = ["view_00", "view_01", "view_02", "view_03"]

@@ -12,7 +12,7 @@ from tests.cases.inputs import WAVELENGTHS_NM, cube, ring, write_envi, write_tra
 from tests.commands.running import SMALL_METHOD, run
 from unmix_plugin.commands.process import process
 from unmix_plugin.commands.train import train
-from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
+from unmix_plugin.spectral.library.spectra_csv import read_spectra
 
 SIZE = 16
 
@@ -151,4 +151,4 @@ def test_a_scene_of_one_value_trains_with_the_one_material_that_is_advised(tmp_p
     ended = trained(tmp_path, "--endmembers", 1)
     assert (ended.status, ended.err) == (0, "")
     run_folder = Path(ended.last_line.removeprefix("run: "))
-    np.testing.assert_allclose(read_spectra_csv(run_folder / "endmembers.csv").spectra, 0.4, atol=0.05)
+    np.testing.assert_allclose(read_spectra(run_folder / "endmembers.csv").spectra, 0.4, atol=0.05)

@@ -21,7 +21,7 @@ from unmix_plugin.engine import registry
 from unmix_plugin.engine.runs.load_run import load_config, load_model
 from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
+from unmix_plugin.spectral.library.spectra_csv import read_spectra
 
 
 def small_training(trained, output_dir, *words):
@@ -42,7 +42,7 @@ def test_a_run_holds_its_settings_its_scene_a_checkpoint_and_its_endmembers(trai
     assert (stored["max_num_iterations"], stored["device"]) == (20, "cpu")
     assert json.loads((trained.run / "training.json").read_text())["steps"] == 20
     assert (trained.run / "checkpoints" / "step-000020.safetensors").is_file()
-    table = read_spectra_csv(trained.run / "endmembers.csv")
+    table = read_spectra(trained.run / "endmembers.csv")
     model: Any = load_model(trained.run, "cpu").model
     assert table.names == tuple(f"endmember_{index}" for index in range(6))
     np.testing.assert_allclose(table.spectra, model.endmembers.detach().numpy(), rtol=1e-6)

@@ -15,7 +15,7 @@ from tests.viewer_page import Page
 from unmix_plugin.commands import train as train_module
 from unmix_plugin.commands.train import parse, train
 from unmix_plugin.engine.training.trainer import Trainer
-from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
+from unmix_plugin.spectral.library.spectra_csv import read_spectra
 from unmix_plugin.viewer import server
 
 
@@ -37,8 +37,8 @@ def test_a_training_is_watched_while_it_runs_and_ends_as_without(trained, tmp_pa
         command.process.send_signal(signal.SIGINT)
         assert command.end() == 0
         assert command.lines[-1].startswith("run: ")
-        found = read_spectra_csv(Path(command.lines[-1].removeprefix("run: ")) / "endmembers.csv")
-        np.testing.assert_array_equal(found.spectra, read_spectra_csv(trained.run / "endmembers.csv").spectra)
+        found = read_spectra(Path(command.lines[-1].removeprefix("run: ")) / "endmembers.csv")
+        np.testing.assert_array_equal(found.spectra, read_spectra(trained.run / "endmembers.csv").spectra)
 
 
 def test_without_keep_open_the_process_ends_with_the_training(trained, tmp_path):

@@ -250,17 +250,16 @@ IN_WAVENUMBERS = ECOSTRESS.replace("(micrometers)", "(cm-1)").replace("Wavelengt
         ("x.csv", "name,value\n400,1\n", "the first column must be headed 'wavelength' .* found 'name'"),
         ("x.csv", "wavelength\n400\n", "there is no column beside the wavelengths"),
         ("x.csv", "wavelength,a,a\n400,1,1\n", "each spectrum needs a name of its own"),
-        ("x.csv", "wavelength,a\n0.4,1\n", "look like micrometres"),
+        ("x.csv", "wavelength_nm,a\n0.4,1\n", "look like micrometres"),
         ("x.csv", "wavelength,a\n400,-999\n", "'a' has no value that was measured"),
         ("x.csv", "wavelength,a\n400,1\n500,-0.1\n", "must not be negative; found -0.1 in 'a' at 500 nm"),
         ("x.txt", "a\n1 0.2\n2 0.3\n3 0.3\n", "wavelengths of 1 to 3 count the bands"),
         ("x.txt", "hello\n", "there are no numbers in it"),
         ("x.txt", "400 1\nend\n", "'end' stands among the numbers"),
         ("x.txt", "400\n500\n", "no lines with a wavelength and a value"),
-        ("x.txt", "Wavelength sand grass\n400 1 1\n", "what column 3, 'grass', means is unknown"),
-        ("x.txt", "nm;dry sand;wet grass\n400;0,1;0,1\n", "what column 3, 'wet grass', means is unknown"),
-        ("x.txt", "400, 1,2\n500, 1,2\n", "3 numbers, and what column 3 means is unknown"),
-        ("x.txt", "400\t0.1\n500\t0,1\t2.0\n", "column 3 means is unknown; .* or write several spectra"),
+        ("x.txt", "Wavelength dry sand wet grass\n400 1 1\n", "line 2 has 3 values, the header has 5"),
+        ("x.txt", "400, 1,2\n500, 1,2\n", "3 numbers, and what column 3 means is unknown; .* a head"),
+        ("x.txt", "400\t0.1\n500\t0,1\t2.0\n", "line 2: '500 0,1 2.0' stands among the numbers"),
         ("x.txt", IN_WAVENUMBERS, "'X Units' is"),
         ("x.txt", ECOSTRESS.replace("Reflectance", "Transmittance"), "'Y Units' is .* expected reflectance"),
         ("x.pdf", "", r"a library is a \.csv, an ENVI spectral library"),
@@ -308,6 +307,12 @@ def test_a_library_is_refused_where_it_covers_too_little_of_what_is_lit(tmp_path
     for light in (None, lights[400], lights[690]):  # 11 of 31 bands, and 2 of 2
         with pytest.raises(SpectrumError, match=r"less than half of 31 bands, 400-700 nm, .* without light"):
             library_of([red], bands, light)
+
+
+def test_several_spectra_in_a_text_have_a_head(tmp_path):
+    for text in ("Wavelength sand grass\n400 0.1 1\n500 0.2 1\n", "nm;sand;grass\n400;0,1;1\n500;0,2;1\n"):
+        expected = [("sand", [400.0, 500.0], [0.1, 0.2]), ("grass", [400.0, 500.0], [1.0, 1.0])]
+        assert spectra_of(written(tmp_path, "x.txt", text)) == expected
 
 
 def test_rows_that_were_left_out_are_a_gap_and_no_line(tmp_path):

@@ -26,7 +26,7 @@ from unmix_plugin.scenes.reading.transforms_json import read_transforms
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.settings import SceneOptions
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
+from unmix_plugin.spectral.library.spectra_csv import read_spectra
 from unmix_plugin.spectral.maps.indices import parse_formula
 from unmix_plugin.spectral.sensor import read_sensor
 from unmix_plugin.trained.camera_files import read_camera_file
@@ -159,7 +159,7 @@ def spectra_csv_reader() -> Reader:
         b"wavelength,leaf,clay\n450,0.1,0.2\n520,0.3,0.5\n600,0.1,0.8\n",
         b'\xef\xbb\xbfwavelength_nm,"power, relative"\r\n\r\n400.5,1\r\n500,2e-3\r\n',
     )
-    return Reader(samples, "spectra.csv", read_spectra_csv, (SpectrumError,))
+    return Reader(samples, "spectra.csv", read_spectra, (SpectrumError,))
 
 
 def responses_reader() -> Reader:

@@ -5,8 +5,6 @@ Notation: `B` bands; wavelengths in nm.
 
 from __future__ import annotations
 
-import csv
-import io
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,8 +14,8 @@ from jaxtyping import Bool, Float64
 
 from unmix_plugin.captures.names import common_length
 from unmix_plugin.errors import ConfigError, SpectrumError
-from unmix_plugin.limits import MOST_ITEMS, allow_parts, read_bounded
-from unmix_plugin.spectral.bands import nm_per_unit, require_nanometres
+from unmix_plugin.spectral.bands import nm_per_unit
+from unmix_plugin.spectral.library.spectral_tables import read_wavelengths, require_wavelengths
 
 _DIGITS = r"\d+(?:[.,]\d+)?"
 _UNIT = r"(?:nm|nanomet(?:er|re)s?|[uµμ]m|micromet(?:er|re)s?|microns?)(?![a-z])"
@@ -140,31 +138,22 @@ def _varying_numbers(names: Sequence[str]) -> list[list[str]]:
 
 
 def parse_wavelengths(text: str) -> Float64[np.ndarray, " B"]:
-    """Band centres in nm from a list `620,555,503`, or from the column `wavelength` of a CSV file.
-
-    A file may also hold one bare number a line, or one line of numbers. Raises ConfigError: no such file, no numbers,
-    or numbers that are not wavelengths in nm.
-    """
+    """Band centres in nm from a list `620,555,503`, or from a text file: its column of wavelengths, one number a line,
+    or one line of numbers. Raises ConfigError: no such file, no numbers, or numbers that are not wavelengths in nm."""
+    what = f"--wavelengths {text}"
     try:
         values = np.array([float(word) for word in text.split(",")])
     except ValueError:
-        values = None
+        try:
+            values = read_wavelengths(Path(text))
+        except SpectrumError as error:
+            raise ConfigError(
+                f"{what}: {error}; expected numbers in nm, such as 620,555,503, or a table with a column 'wavelength'"
+            ) from error
     try:
-        if values is None:
-            values = np.array([float(word) for word in _read_words(Path(text))])
-    except ValueError as error:
-        raise ConfigError(
-            f"--wavelengths {text}: {error}; expected numbers in nm, such as 620,555,503, or a CSV file with a "
-            "column 'wavelength'"
-        ) from error
-    if not len(values):
-        raise ConfigError(f"--wavelengths {text} holds no numbers; expected band centres in nm")
-    if not np.isfinite(values).all():
-        raise ConfigError(f"--wavelengths {text} holds NaN or infinity; expected band centres in nm")
-    try:
-        require_nanometres(values)
+        require_wavelengths(values)
     except SpectrumError as error:
-        raise ConfigError(f"--wavelengths {text}: {error}") from error
+        raise ConfigError(f"{what}: {error}") from error
     return values
 
 
@@ -199,32 +188,3 @@ def in_ranges(text: str, wavelengths_nm: Float64[np.ndarray, " B"]) -> Bool[np.n
             )
         named |= found
     return named
-
-
-def _read_words(path: Path) -> list[str]:
-    try:
-        data = read_bounded(path)
-        allow_parts(path, max(data.count(b"\n"), data.count(b",")), "numbers", ConfigError, MOST_ITEMS)
-        with io.TextIOWrapper(io.BytesIO(data), "utf-8-sig", newline="") as file:
-            rows = [[cell.strip() for cell in row] for row in csv.reader(file) if any(map(str.strip, row))]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise ConfigError(
-            f"--wavelengths {path}: neither a list of numbers, such as 620,555,503, nor a CSV file ({reason})"
-        ) from error
-    if not rows:
-        raise ConfigError(f"--wavelengths {path} is empty; expected a column 'wavelength'")
-    heads = [cell.lower() for cell in rows[0]]
-    column = next((i for i, cell in enumerate(heads) if cell.startswith("wavelength")), None)
-    columns = 1 if column is None else len(heads)
-    longer = next((row for row in rows if any(row[columns:])), None)
-    if longer is not None and (column is not None or len(rows) > 1):
-        expected = f"{columns}, as in the header, and a point as the decimal mark"
-        if column is None:
-            expected = "one number with a decimal point, or a header that names the column 'wavelength'"
-        raise ConfigError(
-            f"--wavelengths {path}: the line '{','.join(longer)[:40]}' has {len(longer)} cells; expected {expected}"
-        )
-    if column is not None:
-        return [row[column] if column < len(row) else "" for row in rows[1:]]
-    return [cell for cell in rows[0] if cell] if len(rows) == 1 else [row[0] for row in rows]

@@ -24,6 +24,7 @@ from jaxtyping import Float, Float32
 
 from unmix_plugin.engine.runs.atomic_files import write_errors_as, write_file
 from unmix_plugin.engine.runs.replacing import refuse_foreign, remove
+from unmix_plugin.engine.tables import decode_text
 from unmix_plugin.formats.files import RowSink, raw_rows
 from unmix_plugin.limits import MOST_BANDS, MOST_ITEMS, MOST_TEXT_BYTES, read_bounded
 from unmix_plugin.spectral.bands import Bands
@@ -91,7 +92,7 @@ def read_header(path: Path) -> dict[str, str]:
     """
     if (size := path.stat().st_size) > MOST_TEXT_BYTES:
         raise ValueError(f"no ENVI header: {size} bytes; expected a text of a few kB")
-    text = _decoded(read_bounded(path))
+    text = decode_text(read_bounded(path))
     try:
         return _parse_header(text)
     except ValueError as error:
@@ -106,19 +107,9 @@ def read_header(path: Path) -> dict[str, str]:
         ) from error
 
 
-def _decoded(data: bytes) -> str:
-    """Text in UTF-8, in UTF-16 with its mark, or in Latin-1."""
-    encoding = "utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8"
-    data = data.removeprefix(b"\xef\xbb\xbf")
-    try:
-        return data.decode(encoding)
-    except UnicodeDecodeError:
-        return data.decode("latin-1")
-
-
 def header_begins(begin: bytes) -> bool:
     """Whether the first bytes of a file are those of a header."""
-    return re.match(r"ENVI\s", _decoded(begin[: len(begin) // 2 * 2])) is not None
+    return re.match(r"ENVI\s", decode_text(begin[: len(begin) // 2 * 2])) is not None
 
 
 def _parse_header(text: str) -> dict[str, str]:

@@ -1,15 +1,6 @@
-"""Files of known spectra, read in one way for every command that takes one: tables, ENVI libraries, text files.
+"""Files of known spectra, read in one way for every command that takes one: ENVI libraries (.sli, .hdr) and texts.
 
-| suffix | what |
-|---|---|
-| .csv | `wavelength,NAME,...`, one row a wavelength; `wavelength_um` if in micrometres, `NAME (%)` if in percent |
-| .sli, .hdr | ENVI spectral library |
-| .txt, .asc | one spectrum: of ECOSTRESS or ASTER, of USGS (splib06, splib07), or two columns of numbers alone |
-
-Wavelengths may stand in any order. What a file marks as not measured, by NaN, -1.23e34 (USGS), -999 and the like, is
-NaN.
-
-Sources: Baldridge et al. 2009 and Meerdink et al. 2019 (ASTER, ECOSTRESS); Kokaly et al. 2017, USGS Data Series 1035.
+What texts there are, and what marks a value that was not measured, is in `spectral.library.spectral_tables`.
 """
 
 from __future__ import annotations
@@ -19,35 +10,31 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Float64
+from jaxtyping import Float
 
 from unmix_plugin.errors import SpectrumError, name_some
 from unmix_plugin.formats.envi import data_beside, header_beside, header_items, read_header, read_layout
-from unmix_plugin.limits import MOST_BANDS, allow_parts, read_bounded
-from unmix_plugin.spectral.bands import Bands, are_band_numbers, nm_per_unit, require_nanometres
+from unmix_plugin.limits import MOST_BANDS, allow_parts
+from unmix_plugin.spectral.bands import Bands, nm_per_unit
 from unmix_plugin.spectral.library.material_library import (
     LibraryMaterial,
     MaterialLibrary,
     measured_library,
 )
-from unmix_plugin.spectral.library.spectra_csv import (
-    PERCENT,
-    is_number,
-    read_number_table,
-    without_percent,
+from unmix_plugin.spectral.library.spectral_tables import (
+    TABLE_SUFFIXES,
+    MeasuredSpectra,
+    read_spectral_text,
+    require_wavelengths,
+    without_markers,
 )
 
 BUILT_IN = "+builtin"
 """Stands among a user's files for the spectra that come with the program."""
 
-LIBRARY_SUFFIXES = ("csv", "sli", "hdr", "txt", "asc")
-_MARKERS, _HIGHEST_MARKER, _LEAST_REFLECTANCE = (-999.0, -9999.0), -99.0, -0.99
-"""Stored numbers that stand for what was not measured: the first, and what is at most both of the others, as it is
-stored and as a reflectance. Noise stored as ten-thousandths reaches one alone."""
+LIBRARY_SUFFIXES = (*TABLE_SUFFIXES, "sli", "hdr")
 _NOISE = 0.02
 """Part of its greatest value by which noise may take a spectrum below 0."""
-_LARGEST_UM = 100.0
-"""Greatest wavelength of a text file that doesn't say in which unit: up to here it is micrometres."""
 _SMALLEST_SCALE = 1e-30
 
 
@@ -83,18 +70,18 @@ def read_library(path: Path) -> list[LibraryMaterial]:
     Raises:
         SpectrumError: another kind of file, or one that can't be read; negative values that are not noise.
     """
-    readers = {"csv": _read_csv, "sli": _read_envi, "hdr": _read_envi, "txt": _read_text, "asc": _read_text}
-    reader = readers.get(path.suffix.lower()[1:])
-    if reader is None:
+    suffix = path.suffix.lower()[1:]
+    if suffix not in LIBRARY_SUFFIXES:
+        binary = (
+            "; ASD's own files are binary: export them as text with ViewSpec Pro" if suffix == "asd" else ""
+        )
         raise SpectrumError(
             f"{path}: a library is a .csv, an ENVI spectral library (.hdr and .sli), or a text file (.txt, .asc) as "
-            f"ECOSTRESS and USGS have them; {BUILT_IN} adds the built-in spectra"
+            f"ECOSTRESS, USGS and field spectrometers (.sig, .sed) have them; {BUILT_IN} adds the built-in "
+            f"spectra{binary}"
         )
     try:
-        names, wavelengths_nm, stored, scale = reader(path)
-        spectra = stored / scale
-        is_marker = (stored <= _HIGHEST_MARKER) & (spectra <= _LEAST_REFLECTANCE) | np.isin(stored, _MARKERS)
-        return _materials(names, wavelengths_nm, np.where(is_marker, np.nan, spectra), path)
+        return _materials((_read_envi if suffix in ("sli", "hdr") else read_spectral_text)(path), path)
     except OSError as error:
         raise SpectrumError(f"{error.filename or path}: can't read: {error.strerror or error}") from error
     except (SpectrumError, ValueError) as error:
@@ -139,18 +126,13 @@ def _named(materials: Sequence[LibraryMaterial]) -> list[LibraryMaterial]:
     return list(taken.values())
 
 
-_Table = tuple[
-    Sequence[str], Float64[np.ndarray, " B"], Float64[np.ndarray, "K B"], float | Float64[np.ndarray, "K 1"]
-]
-"""Names, wavelengths in nm in any order, spectra as they are stored, and what they are to be divided by."""
-
-
-def _materials(
-    names: Sequence[str], wavelengths_nm: np.ndarray, spectra: np.ndarray, path: Path
-) -> list[LibraryMaterial]:
+def _materials(given_spectra: MeasuredSpectra, path: Path) -> list[LibraryMaterial]:
     """In order of wavelength, with NaN for what was not measured, also in the middle of a gap where rows were left out;
     of values at one wavelength the mean."""
-    require_nanometres(wavelengths_nm)
+    names, wavelengths_nm, spectra = given_spectra.names, given_spectra.wavelengths_nm, given_spectra.values
+    if not all(names) or len(set(names)) < len(names):
+        raise SpectrumError(f"each spectrum needs a name of its own; found {name_some(names, 8)}")
+    require_wavelengths(wavelengths_nm)
     given = Bands(np.unique(wavelengths_nm))
     middles, (low, high) = given.edges_nm[1:-1], given.intervals_nm.T
     gaps = middles[(high[:-1] < middles) & (low[1:] > middles)]
@@ -175,27 +157,6 @@ def _materials(
     return found
 
 
-_CSV_HEAD = re.compile(
-    r"(?:wave ?length|wl|lambda)s?[\s_]*[\[(]?\s*(?:in )?([^\])]*?)\s*[\])]?", re.IGNORECASE
-)
-
-
-def _read_csv(path: Path) -> _Table:
-    header, values = read_number_table(path)
-    head = _CSV_HEAD.fullmatch(header[0])
-    factor = None if head is None else nm_per_unit(head[1] or "nm")
-    if factor is None:
-        raise SpectrumError(
-            f"the first column must be headed 'wavelength' (in nm) or 'wavelength_um'; found '{header[0]}'"
-        )
-    if len(header) == 1:
-        raise SpectrumError("no spectra: there is no column beside the wavelengths")
-    names, scales = without_percent(header[1:])
-    if not all(names) or len(set(names)) < len(names):
-        raise SpectrumError(f"each spectrum needs a name of its own; found {name_some(names, 8)}")
-    return names, values[:, 0] * factor, values[:, 1:].T, scales
-
-
 _PERCENT_UNIT = re.compile(r"percent|per cent|%", re.IGNORECASE)
 _KEYS = ("reflectance scale", "data ignore", "data gain", "data offset", "bbl", "wavelength", "spectra names")
 """Of a header of spectra, beside those of its layout."""
@@ -209,7 +170,7 @@ def _header_of_spectra(path: Path) -> dict[str, str]:
     return header
 
 
-def _read_envi(path: Path) -> _Table:
+def _read_envi(path: Path) -> MeasuredSpectra:
     """Of the header these keys count beside those of the layout: `wavelength` and `wavelength units`, `spectra names`,
     `reflectance scale factor` (values are divided by it), `data ignore value`, and `bbl`, whose bad bands are gaps.
     Percent in `y units` or `z plot titles` is divided by 100, where no factor says otherwise."""
@@ -252,7 +213,8 @@ def _read_envi(path: Path) -> _Table:
     scale = _number(header, "reflectance scale factor", "100" if is_percent else "1")
     if not _SMALLEST_SCALE <= scale <= 1.0 / _SMALLEST_SCALE:
         raise ValueError(f"'reflectance scale factor' is {scale:g}; expected a number above 0, such as 10000")
-    return names, _wavelengths(header, num_bands) * factor, values, scale
+    nm = _wavelengths(header, num_bands) * factor
+    return MeasuredSpectra(tuple(names), nm, without_markers(values, scale))
 
 
 def _wavelengths(header: Mapping[str, str], num_bands: int) -> np.ndarray:
@@ -272,86 +234,3 @@ def _number(header: Mapping[str, str], key: str, default: str = "") -> float:
         return float(header.get(key, default))
     except ValueError:
         raise ValueError(f"'{key}' is {header.get(key)}; expected a number") from None
-
-
-_DEVIATION = re.compile(r"std|stdev|deviation|error|uncertainty|sigma", re.IGNORECASE)
-_UNITS_OF_X = {"micromet": 1000.0, "micron": 1000.0, "nanomet": 1.0}
-
-
-def _read_text(path: Path) -> _Table:
-    """A spectrum with lines of text before its numbers: one a line (splib07), or a wavelength and a value."""
-    words, numbers = _words_and_numbers(path)
-    said = {key.strip().lower(): value.strip() for key, _, value in (line.partition(":") for line in words)}
-    record = re.match(r"\s*(\S+) Record=\d+:\s*(.*\S)", words[0]) if words else None
-    is_usgs = record is not None or any("USGS" in line for line in words[:3])
-    if record is not None and all(len(row) == 1 for row in numbers):
-        values = np.array([row[0] for row in numbers])
-        return [" ".join(record[2].split())], _usgs_wavelengths(path, len(values)), values[None], 1.0
-    rows = np.array([row[:2] for row in numbers if len(row) >= 2])
-    if not len(rows):
-        raise SpectrumError("no lines with a wavelength and a value")
-    head = words[-1] if words else ""
-    count = max(map(len, numbers))
-    if count > 2 + is_usgs:  # those of USGS have deviations in the third column
-        heads = next((x for x in (re.split(r"[\t;,]", head.strip()), head.split()) if len(x) == count), None)
-        third = "column 3" if heads is None else f"column 3, '{heads[2].strip()}',"
-        if count > 3 or heads is None or not _DEVIATION.search(heads[2]):
-            raise SpectrumError(
-                f"a line has {count} numbers, and what {third} means is unknown; leave a wavelength and a value, or "
-                "write several spectra as a .csv headed 'wavelength,NAME,...'"
-            )
-    kept = rows[:, 0] > 0
-    wavelengths, values = rows[kept].T
-    unit = said.get("x units", "").lower()
-    factor = next((factor for word, factor in _UNITS_OF_X.items() if word in unit), None)
-    if factor is None:
-        if unit:
-            raise SpectrumError(f"'X Units' is {said['x units']!r}; expected micrometers or nanometers")
-        is_um = wavelengths.max(initial=0) < _LARGEST_UM and not are_band_numbers(rows[:, 0])
-        factor = 1000.0 if is_um else 1.0
-    quantity = said.get("y units", "reflectance").lower()
-    if "reflectance" not in quantity:
-        raise SpectrumError(f"'Y Units' is {said['y units']!r}; expected reflectance")
-    # The second line from the last before the numbers of splib06 is the title.
-    title = said.get("name") or (words[-2] if is_usgs and len(words) > 1 else path.stem)
-    scale = 100.0 if "percent" in quantity or PERCENT.search(head) else 1.0
-    return [" ".join(title.split())], wavelengths * factor, values[None], scale
-
-
-def _words_and_numbers(path: Path) -> tuple[list[str], list[list[float]]]:
-    """Lines of text before the numbers, and the numbers of each line after; empty lines left out.
-
-    A comma is the decimal mark between digits of a line whose numbers something else parts: `400<tab>0,25`.
-    """
-    text = read_bounded(path).decode("utf-8-sig", "replace")
-    allow_parts(path, text.count("\n"), "lines", SpectrumError, MOST_BANDS)
-    words: list[str] = []
-    numbers: list[list[float]] = []
-    for line in filter(str.strip, text.splitlines()):
-        line = line.strip()
-        if "." not in line and re.search(r"[\s;]", line) and not re.search(r"\D,|,\D", line):
-            line = line.replace(",", ".")
-        parts = re.split(r"[\s,;]+", line.strip(",; \t"))
-        if parts and all(map(is_number, parts)):
-            numbers.append([float(part) for part in parts])
-        elif numbers:
-            raise SpectrumError(f"{line[:40]!r} stands among the numbers")
-        else:
-            words.append(line)
-    if not numbers:
-        raise SpectrumError("there are no numbers in it")
-    return words, numbers
-
-
-def _usgs_wavelengths(path: Path, count: int) -> Float64[np.ndarray, " B"]:
-    """Of splib07, whose spectra are lists of values alone: the one list of wavelengths of that length nearby."""
-    folders = (path.parent, path.resolve().parent.parent)
-    near = [one for folder in folders for one in sorted(folder.glob("*[Ww]avelengths*.txt"))]
-    columns = ([row[0] for row in _words_and_numbers(one)[1] if len(row) == 1] for one in near)
-    lists = {tuple(column) for column in columns if len(column) == count}
-    if len(lists) != 1:
-        raise SpectrumError(
-            f"it has {count} values without wavelengths, and {len(lists)} lists of {count} wavelengths lie beside it "
-            "or above; put the *Wavelengths*.txt of its spectrometer there"
-        )
-    return np.array(lists.pop()) * 1000.0

@@ -32,6 +32,8 @@ _NM_PER_UNIT = {
     **dict.fromkeys(("nm", "nanometer", "nanometers", "nanometre", "nanometres"), 1.0),
     **dict.fromkeys(("um", "µm", "μm", "micron", "microns"), 1e3),
     **dict.fromkeys(("micrometer", "micrometers", "micrometre", "micrometres"), 1e3),
+    **dict.fromkeys(("nanomètre", "nanomètres", "nanometro", "nanometri", "nanometros", "nanómetros"), 1.0),
+    **dict.fromkeys(("mikrometer", "mikron", "micromètre", "micromètres", "micrometri", "micrómetros"), 1e3),
     **dict.fromkeys(("a", "å", "angstrom", "angstroms"), 0.1),
     **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), 1e9),
 }

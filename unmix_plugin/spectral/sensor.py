@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float64
 
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.bands import Bands, integrals_up_to
-from unmix_plugin.spectral.library.spectra_csv import SpectraTable, read_spectra_csv
+from unmix_plugin.spectral.library.spectra_csv import SpectraTable, read_spectra
 
 _MOST_UNSEEN = 0.01
 """Largest part of a channel's response that may lie where there are no bands."""
@@ -134,8 +134,9 @@ class Sensor:
 
 
 def read_sensor(path: Path) -> Sensor:
-    """A sensor from a CSV file, `wavelength,NAME,NAME,...`, of relative spectral responses; its name is the file's."""
-    table = read_spectra_csv(path)
+    """A sensor from a table of relative spectral responses, `wavelength,NAME,NAME,...`; its name is the file's. Where a
+    channel alone was not measured, it responds to nothing."""
+    table = read_spectra(path, outside=0.0)
     try:
         return Sensor(path.stem, table)
     except SpectrumError as error:

@@ -33,7 +33,7 @@ from unmix_plugin.neumatex.fit.trained_object import TrainedObject
 from unmix_plugin.neumatex.tracing.families import SpectralFamily
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.colour.conversion import agx
-from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
+from unmix_plugin.spectral.library.spectra_csv import read_spectra
 from unmix_plugin.trained.model_scene import LightChoice
 from unmix_plugin.trained.open_run import load_run, snapshot
 from unmix_plugin.viewer.rendering.painting import layers_of
@@ -253,7 +253,7 @@ def test_another_light_in_colours_gets_the_lamps_spectrum(scene):
 def test_the_export_has_abundance_textures_and_endmembers(spectral):
     done(export, "material", "--run", spectral, "--device", "cpu", "--texture-size", 64)
     folder = spectral / "exports" / "material"
-    table = read_spectra_csv(folder / "endmembers.csv")
+    table = read_spectra(folder / "endmembers.csv")
     assert table.names == ("endmember_0", "endmember_1")
     found = table.spectra / np.linalg.norm(table.spectra, axis=1, keepdims=True)
     true = factory.ENDMEMBERS / np.linalg.norm(factory.ENDMEMBERS, axis=1, keepdims=True)

@@ -11,7 +11,7 @@ from unmix_plugin.errors import ConfigError, SceneError, SpectrumError
 from unmix_plugin.scenes.demo import scene as demo_scene
 from unmix_plugin.scenes.demo.shading import MATERIALS, _trace, band_centers_nm, lamp_power, reflectances
 from unmix_plugin.scenes.demo.shapes import first_hits
-from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
+from unmix_plugin.spectral.library.spectra_csv import read_spectra
 
 
 @pytest.fixture(scope="module")
@@ -120,7 +120,7 @@ def test_a_scene_has_the_layout_that_transforms_json_names(folder):
 def test_another_light_changes_each_band_of_the_scene_by_one_factor(tmp_path):
     demo_scene.make_demo_scene(tmp_path / "day", size=16, bands=7, views=4)
     demo_scene.make_demo_scene(tmp_path / "lamp", size=16, bands=7, views=4, illuminant="A")
-    lamps = [read_spectra_csv(tmp_path / name / "illuminant.csv").spectra[0] for name in ("day", "lamp")]
+    lamps = [read_spectra(tmp_path / name / "illuminant.csv").spectra[0] for name in ("day", "lamp")]
     assert_allclose(lamps[1], lamp_power(band_centers_nm(7), "A"), rtol=1e-8)
     assert lamps[1].argmax() == 6 != lamps[0].argmax()
     cubes = [np.load(tmp_path / name / "cubes/eval_002.npy").astype(float) for name in ("day", "lamp")]

@@ -25,7 +25,7 @@ from unmix_plugin.spectral.colour.conversion import (
     xyz_matrix,
 )
 from unmix_plugin.spectral.colour.srgb import decode_srgb, encode_srgb
-from unmix_plugin.spectral.library.spectra_csv import SpectraTable, read_spectra_csv, write_spectra_csv
+from unmix_plugin.spectral.library.spectra_csv import SpectraTable, read_spectra, write_spectra_csv
 
 EVERY_NM = Bands.of(range(360, 831))
 
@@ -114,7 +114,7 @@ def test_false_colour_shows_the_longest_third_red_and_the_shortest_blue_and_says
         (lambda _: xyz_matrix(Bands.of([900, 1000, 1100])), "3 bands, 900-1100 nm hold no visible light"),
         (lambda _: parse_light("D66"), "there is no light 'D66'; nearest: D65"),
         (lambda _: parse_light(""), "known are, among others, A, D50"),
-        (lambda _: parse_light("lamp.txt"), r"or give a \.csv file"),
+        (lambda _: parse_light("lamp.dat"), r"or give a \.csv file"),
     ],
 )
 def test_what_a_sensor_does_not_see_or_nobody_knows_is_refused(ask, message):
@@ -208,7 +208,7 @@ def test_a_light_that_is_written_at_its_bands_and_read_again_is_the_same(tmp_pat
     power = illuminant_power(name, bands)
     write_spectra_csv(tmp_path / "lamp.csv", SpectraTable(bands, ("power",), power[None]))
     np.testing.assert_allclose(illuminant_power(tmp_path / "lamp.csv", bands), power, rtol=1e-6)
-    read = read_spectra_csv(tmp_path / "lamp.csv").resampled(bands)
+    read = read_spectra(tmp_path / "lamp.csv").resampled(bands)
     np.testing.assert_allclose(read.spectra, power[None], rtol=1e-6)
 
 

@@ -7,7 +7,7 @@ from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.spectra_csv import (
     SpectraTable,
-    read_spectra_csv,
+    read_spectra,
     resample_spectra,
     write_spectra_csv,
 )
@@ -27,7 +27,7 @@ def test_float32_spectra_survive_a_file_exactly(values, tmp_path_factory):
     path = tmp_path_factory.mktemp("csv") / "e.csv"
     spectra = np.array(values, dtype=np.float32).reshape(2, 3)
     write_spectra_csv(path, SpectraTable(SMALL.bands, SMALL.names, spectra.astype(np.float64)))
-    table = read_spectra_csv(path)
+    table = read_spectra(path)
     np.testing.assert_array_equal(table.spectra.astype(np.float32), spectra)
     assert (table.bands, table.names) == (SMALL.bands, SMALL.names)
     assert path.read_text().startswith('wavelength,leaf,"soil, dry"\n400,')
@@ -35,14 +35,20 @@ def test_float32_spectra_survive_a_file_exactly(values, tmp_path_factory):
 
 def test_a_byte_order_mark_blank_lines_spaces_and_windows_line_ends_are_read(tmp_path):
     text = "Wavelength, leaf ,soil\r\n400,0.1,0.2\r\n\r\n500, 0.3 ,0.4\r\n,,\r\n"
-    table = read_spectra_csv(written(tmp_path, text, "utf-8-sig"))
+    table = read_spectra(written(tmp_path, text, "utf-8-sig"))
     assert table.names == ("leaf", "soil")
     np.testing.assert_array_equal(table.spectra, [[0.1, 0.3], [0.2, 0.4]])
     np.testing.assert_array_equal(table.bands.centers_nm, [400, 500])
 
 
+def test_wavelengths_may_fall_and_rows_without_a_measurement_at_the_ends_are_left_out(tmp_path):
+    table = read_spectra(written(tmp_path, "wavelength,leaf\n700,nan\n600,0.3\n500,0.2\n400,\n"))
+    np.testing.assert_array_equal(table.bands.centers_nm, [500, 600])
+    np.testing.assert_array_equal(table.spectra, [[0.2, 0.3]])
+
+
 def test_columns_in_percent_are_divided_as_those_of_libraries_are(tmp_path):
-    table = read_spectra_csv(written(tmp_path, "wavelength,leaf (%),clay 20 %\n400,5,0.5\n500,30,0.6\n"))
+    table = read_spectra(written(tmp_path, "wavelength,leaf (%),clay 20 %\n400,5,0.5\n500,30,0.6\n"))
     assert table.names == ("leaf", "clay 20 %")
     np.testing.assert_allclose(table.spectra, [[0.05, 0.3], [0.5, 0.6]])
 
@@ -52,33 +58,34 @@ def test_columns_in_percent_are_divided_as_those_of_libraries_are(tmp_path):
     [
         ("", "file is empty"),
         ("\n\n", "file is empty"),
-        ("nm,leaf\n400,1\n", "first column must be headed 'wavelength' .* found 'nm'"),
-        ("wavelength\n400\n", "no column beside 'wavelength'"),
+        ("furlongs,leaf\n400,1\n", "first column must be headed 'wavelength' .* found 'furlongs'"),
+        ("wavelength\n400\n", "no column beside the wavelengths"),
         ("wavelength,leaf\n", "no row of values"),
         ("wavelength,leaf,leaf\n400,1,1\n", "must differ; found 'leaf' 2 times"),
         ("wavelength,leaf,\n400,1,1\n", "each spectrum needs a name"),
         ("wavelength,leaf\n400,1\n\n500,1,2\n", "line 4 has 3 values, the header has 2"),
         ("wavelength,leaf\n400,1\n500,bright\n", "line 3, column 'leaf': 'bright' is not a number"),
-        ("wavelength,leaf\n400,1\n500,\n", "line 3, column 'leaf': '' is not a number"),
-        ("wavelength,leaf\n400,1\n500,nan\n", "spectra must be finite; found nan in 'leaf' at 500 nm"),
+        ("wavelength,leaf\n400,1\n500,\n600,1\n", "spectra must be finite; found nan in 'leaf' at 500 nm"),
+        ("wavelength,leaf\n400,1\n500,nan\n600,1\n", "spectra must be finite; found nan in 'leaf' at 500"),
+        ("wavelength,leaf,soil\n400,1,1\n500,,1\n", "spectra must be finite; found nan in 'leaf' at 500"),
         ("wavelength,leaf\n400,inf\n", "spectra must be finite; found inf in 'leaf' at 400 nm"),
         ("wavelength,leaf,soil\n400,1,1\n500,1,-0.5\n", "not be negative; found -0.5 in 'soil' at 500 nm"),
-        ("wavelength,leaf\n500,1\n400,1\n", "strictly increase; found 500 nm at index 0 then 400 nm"),
+        ("wavelength,leaf\n500,1\n500,1\n", "strictly increase; found 500 nm at index 0 then 500 nm"),
         ("wavelength,leaf\n-4,1\n", "be positive; found -4 nm"),
     ],
 )
 def test_a_faulty_file_is_refused_with_its_name_and_the_place(tmp_path, text, message):
     path = written(tmp_path, text)
     with pytest.raises(SpectrumError, match=f"spectra.csv: .*{message}"):
-        read_spectra_csv(path)
+        read_spectra(path)
 
 
 def test_a_file_that_is_missing_a_folder_or_no_text_is_refused(tmp_path):
-    written(tmp_path, "wavelength,caf\xe9\n400,1\n", "latin-1")
+    (tmp_path / "spectra.csv").write_bytes(b"\x89PNG\r\n\x1a\n\x00\x00wavelength,leaf\n400,1\n")
     missing = r"nowhere\.csv: can't read spectra: No such file"
-    for name, said in (("nowhere.csv", missing), ("", "read spectra"), ("spectra.csv", "CSV file in UTF-8")):
+    for name, said in (("nowhere.csv", missing), ("", "read spectra"), ("spectra.csv", "is no text")):
         with pytest.raises(SpectrumError, match=said):
-            read_spectra_csv(tmp_path / name)
+            read_spectra(tmp_path / name)
 
 
 @given(st.floats(-1, 1), st.lists(st.floats(401, 599), min_size=1, max_size=9, unique_by=round))

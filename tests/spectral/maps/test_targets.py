@@ -111,7 +111,7 @@ def gold(tmp_path):
         write_spectra_csv(tmp_path / f"{name}.csv", table)
     table = SpectraTable(PAINTS.bands, ("gold", "coal"), PAINTS.spectra[[0, 0]] * [[100], [2]])
     write_spectra_csv(tmp_path / "dark.csv", table)
-    (tmp_path / "bad.csv").write_text("nm,gold\n400,1\n")
+    (tmp_path / "bad.csv").write_text("furlong,gold\n400,1\n")
     return tmp_path / "gold.csv"
 
 

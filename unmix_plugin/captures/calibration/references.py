@@ -26,7 +26,7 @@ from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.errors import CaptureError, ConfigError, SpectrumError, counted, name_some
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.srgb import decode_srgb
-from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
+from unmix_plugin.spectral.library.spectra_csv import read_spectra
 
 _BLOCK_VALUES = 1 << 22
 """Values read together."""
@@ -280,7 +280,7 @@ def _stretched(mean: Float32[np.ndarray, "1 V B"], width: int) -> Float32[np.nda
 def _as_white(
     panel: Reference, dark: Reference | None, reflectance: str, wavelengths_nm: Float64[np.ndarray, " B"]
 ) -> Reference:
-    """A white panel that is brighter than its dark, with its reflectance: a number, or that of a CSV file."""
+    """A white panel that is brighter than its dark, with its reflectance: a number, or that of a table."""
     white = replace(panel, dark=panel.dark or dark)
     light = white.signal
     if not (light > 0).mean() > 0.5:
@@ -294,9 +294,9 @@ def _as_white(
     except ValueError:
         if not Path(reflectance).is_file():
             raise ConfigError(
-                f"--white-reflectance {reflectance}: expected a number such as 0.99, or a CSV file"
+                f"--white-reflectance {reflectance}: expected a number such as 0.99, or a table"
             ) from None
-        table = read_spectra_csv(Path(reflectance))
+        table = read_spectra(Path(reflectance))
         if len(table.names) != 1:
             found = f"found {len(table.names)}"
             raise SpectrumError(f"{reflectance}: expected one column beside 'wavelength'; {found}") from None

@@ -22,7 +22,7 @@ from jaxtyping import Float, Float32, Float64
 from torch import Tensor
 
 from unmix_plugin.errors import CaptureError, SceneError, SpectrumError, counted
-from unmix_plugin.formats.libraries import read_library
+from unmix_plugin.formats.libraries import LIBRARY_SUFFIXES, read_library
 from unmix_plugin.limits import MOST_TABLE_BYTES, allow_decoded, read_bounded
 from unmix_plugin.neumatex.tracing.environment import Environment
 from unmix_plugin.spectral.bands import Bands
@@ -36,7 +36,6 @@ _NEW_RUNS = (8, 0x7FFF)
 """Widths, in pixels, that may have the newer run-length code."""
 _LUMINANCE = (0.2126, 0.7152, 0.0722)
 """Of the sRGB primaries."""
-_FILES = (".csv", ".hdr", ".sli")
 
 
 def read_environment(
@@ -227,7 +226,7 @@ def read_lamp(lamp: str, bands: Bands) -> Float64[np.ndarray, " B"]:
         SpectrumError: the file is missing, malformed or holds several spectra; a light that is not known; one that is
             not known at all bands, or zero in one of them.
     """
-    is_file = Path(lamp).suffix.lower() in _FILES
+    is_file = Path(lamp).suffix.lower()[1:] in LIBRARY_SUFFIXES
     power = _power_of_table(Path(lamp), bands) if is_file else illuminant_power(parse_light(lamp), bands)
     if not (power > 0).all():
         dark = bands.centers_nm[int(np.argmin(power))]

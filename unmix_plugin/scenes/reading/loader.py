@@ -25,7 +25,7 @@ from unmix_plugin.scenes.scene import Frame, Scene
 from unmix_plugin.settings import SceneOptions
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import illuminant_power
-from unmix_plugin.spectral.library.spectra_csv import SpectraTable, read_spectra_csv
+from unmix_plugin.spectral.library.spectra_csv import SpectraTable, read_spectra
 
 _NOTHING_TO_SEE = (
     "the training views show nothing but a plain backdrop or sky: there is no shape that could be learnt"
@@ -118,7 +118,7 @@ def read_endmembers(
 ) -> SpectraTable | None:
     """True endmembers in the order of `materials`, matched by name; None and a noted fault if they do not fit."""
     try:
-        table = read_spectra_csv(path).resampled(Bands(wavelengths_nm))
+        table = read_spectra(path).resampled(Bands(wavelengths_nm))
     except SpectrumError as error:
         return faults.add("'endmembers_path'", str(error))
     if materials is None:

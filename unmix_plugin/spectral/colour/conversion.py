@@ -31,7 +31,8 @@ from torch import Tensor
 
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.bands import VISIBLE_RANGE_NM, Bands, integrals_up_to
-from unmix_plugin.spectral.library.spectra_csv import TOLERANCE_NM, read_spectra_csv, resample_spectra
+from unmix_plugin.spectral.library.spectra_csv import TOLERANCE_NM, read_spectra, resample_spectra
+from unmix_plugin.spectral.library.spectral_tables import TABLE_SUFFIXES
 
 _FORMULA_RANGE_NM = (250.0, 3000.0)
 """Where the lights that are defined by a formula are given."""
@@ -65,7 +66,7 @@ _CURVE = (15.5, -40.14, 31.96, -6.868, 0.4298, 0.1191, -0.00232)
 
 
 def parse_light(text: str) -> str | Path:
-    """A light as a user writes it: the name of a known one, or the path of a CSV file.
+    """A light as a user writes it: the name of a known one, or the path of a table of its spectrum.
 
     >>> parse_light("d65")
     'D65'
@@ -74,7 +75,7 @@ def parse_light(text: str) -> str | Path:
     wanted = text.strip().casefold()
     if wanted in spelled:
         return spelled[wanted]
-    if wanted.endswith(".csv"):
+    if Path(wanted).suffix[1:] in TABLE_SUFFIXES:
         return Path(text.strip())
     near = [spelled[key] for key in difflib.get_close_matches(wanted, spelled, n=3, cutoff=0.5)]
     hint = f"nearest: {', '.join(near)}" if near else "known are, among others, A, D50, D65, E, FL2, FL11"
@@ -92,7 +93,7 @@ def illuminant_power(
     """Relative power of a light in each band, greatest 1, as `power_in_bands` finds it.
 
     Args:
-        light: A name as `parse_light` gives it, or a CSV file, `wavelength,power`.
+        light: A name as `parse_light` gives it, or a table, `wavelength,power`.
         beyond: What to do in bands at whose centres the light is not known: refuse, or hold its outermost value.
     Raises:
         SpectrumError: an unknown name, a file that is not one light, or a light that is zero or unknown at bands.
@@ -143,7 +144,7 @@ def brightness(power: Float64[np.ndarray, " B"], bands: Bands) -> float:
 def _table(light: str | Path) -> tuple[Bands, Float64[np.ndarray, " N"]]:
     if not isinstance(light, Path):
         return _tables()[str(parse_light(light))]
-    table = read_spectra_csv(light)
+    table = read_spectra(light)
     if len(table.names) != 1:
         raise SpectrumError(
             f"{light}: a light has two columns, wavelength and power; found {len(table.names) + 1}"

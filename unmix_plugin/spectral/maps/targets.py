@@ -22,6 +22,7 @@ from torch import Tensor
 from unmix_plugin.errors import ConfigError, SpectrumError, did_you_mean
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.material_library import LibraryMaterial, MaterialLibrary
+from unmix_plugin.spectral.library.spectral_tables import TABLE_SUFFIXES
 from unmix_plugin.spectral.metrics import spectral_angle
 
 LOADING = 1e-3
@@ -34,7 +35,8 @@ _LEAST_DISTANCE = 1e-4
 _DetectionMethod = Literal["angle", "mf", "ace"]
 """Spectral angle, matched filter, adaptive coherence estimator."""
 _GRAMMAR = re.compile(
-    rf"((?P<method>{'|'.join(get_args(_DetectionMethod))}):)?(?P<file>.+?\.(csv|sli|hdr|txt|asc))(#(?P<name>.*?))?"
+    rf"((?P<method>{'|'.join(get_args(_DetectionMethod))}):)?"
+    rf"(?P<file>.+?\.({'|'.join(TABLE_SUFFIXES)}|sli|hdr))(#(?P<name>.*?))?"
     r"(\s*(?P<side>[<>])\s*(?P<limit>[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?)\s*)?",
     re.IGNORECASE | re.DOTALL,
 )

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
+from unmix_plugin.spectral.library.spectra_csv import read_spectra
 from unmix_plugin.spectral.unmixing.abundances import nnls
 from unmix_plugin.spectral.unmixing.kmeans_normalised import normalised_kmeans, scale_to_lit_pixels
 from unmix_plugin.spectral.unmixing.pooled_search import pooled_search
@@ -185,7 +185,7 @@ def given_endmembers(
         ConfigError: another number of spectra than `count`.
         SpectrumError: they don't cover the bands, or explain no pixel.
     """
-    table = read_spectra_csv(path).resampled(bands)
+    table = read_spectra(path).resampled(bands)
     if len(table.names) != count:
         raise ConfigError(
             f"{path} has {len(table.names)} spectra but num-endmembers is {count}; give both the same number"
