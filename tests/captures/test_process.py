@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from filelock import FileLock
 from PIL import Image
 
@@ -31,6 +32,7 @@ from unmix_plugin.captures.writing.view_files import FULL_SCALE, write_view
 from unmix_plugin.engine.runs.replacing import LIST_NAME
 from unmix_plugin.errors import CaptureError, ConfigError, RunError
 from unmix_plugin.scenes.reading.loader import load_scene
+from unmix_plugin.spectral.materials import seen_reflectance
 
 pytestmark = pytest.mark.usefixtures("no_contact_sheet")
 
@@ -233,6 +235,17 @@ def test_the_lamp_is_read_off_the_white_and_reflectances_are_seen_in_flat_light(
     np.testing.assert_allclose(written[:, 1], lamp / lamp.max(), rtol=1e-4)
     np.testing.assert_array_equal(scene.illuminant, np.ones(len(WAVELENGTHS_NM)))
     np.testing.assert_allclose(scene.cube(0), capture.reflectance["view_00"] * panel, atol=1.0 / 1000)
+
+
+@pytest.mark.parametrize("scale", [0.5, 2.5])
+def test_reflectance_is_what_was_measured_whatever_it_was_divided_by(tmp_path: Path, capture, scale):
+    scene, _ = made(tmp_path, capture, **references_of(capture), scale=scale)
+    expected = capture.reflectance["view_00"]
+    stored = torch.from_numpy(scene.cube(0)).double()
+    light = torch.from_numpy(present(scene.illuminant))
+    found = seen_reflectance(stored, torch.ones(stored.shape[:2]), light).numpy()
+    assert (expected > scale).any() == (scale < 1)  # what lies above the scale is cut off
+    np.testing.assert_allclose(found, expected.clip(max=scale), atol=2e-3 * scale)
 
 
 @pytest.mark.parametrize(

@@ -257,8 +257,9 @@ def _doubts_of_values(sensors: Sequence[Sensor], found_scale: float) -> Iterator
         if any("white" in sensor.evidence for sensor in sensors):
             why += " (was the white exposed and lit as the views were?)"
         yield (
-            f"values ({units}) were divided by {found_scale:g}, as {why}: multiply exported spectra by "
-            f"{found_scale:g}, or keep values with --scale 1, which cuts off those above 1"
+            f"values ({units}) were divided by {found_scale:g}, as {why}: outputs of reflectance undo it, and "
+            f"exported radiance times {found_scale:g} is what was measured; --scale 1 keeps values, and cuts off those "
+            "above 1"
         )
     if any(_is_below_black(sensor.sample) for sensor in sensors):
         yield (

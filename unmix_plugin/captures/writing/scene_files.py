@@ -167,8 +167,12 @@ def _write_points(folder: Path, poses: PoseSet) -> dict[str, str]:
     return {"ply_file_path": _POINTS_NAME}
 
 
-def _write_light(folder: Path, plan: Plan) -> dict[str, str]:
-    """The light on the white panel, for people, and the flat one in which reflectances are seen; keys of the scene."""
+def _write_light(folder: Path, plan: Plan) -> dict[str, Any]:
+    """The light on the white panel, for people, and the flat one in which reflectances are seen; keys of the scene.
+
+    Where reflectances were divided by a scale, a perfect white is stored as 1 over it, which readers make the power of
+    this light: whatever is divided by it is reflectance again.
+    """
     first, *others = sensors = list(plan.sensors.values())
     # Where nobody says what 1 is, values that had to be divided may be per cent, or anything.
     if not all(sensor.is_reflectance and (sensor.is_stated or plan.scale == 1.0) for sensor in sensors):
@@ -178,7 +182,8 @@ def _write_light(folder: Path, plan: Plan) -> dict[str, str]:
         write_spectra_csv(folder / _ILLUMINANT_NAME, lamp)
     bands = Bands(np.unique(np.concatenate([sensor.centers_nm for sensor in sensors])))
     write_spectra_csv(folder / _FLAT_LIGHT_NAME, SpectraTable(bands, ("power",), np.ones((1, len(bands)))))
-    return {"illuminant_path": _FLAT_LIGHT_NAME}
+    divided = {} if plan.scale == 1.0 else {"reflectance_of_1": plan.scale}
+    return {"illuminant_path": _FLAT_LIGHT_NAME, **divided}
 
 
 def _has_bands_of(sensor: Sensor, other: Sensor) -> bool:

@@ -53,6 +53,7 @@ _OF_SCENES = frozenset(
     datadir applied_transform applied_scale offset ply_file_path wavelengths fwhm value_scale metres_per_unit
     train_filenames val_filenames test_filenames materials illuminant_path endmembers_path mesh_path environment_path
     environment_rotation_deg environment_exposure_stops tone_mapping left_out calibrated_value_of_1
+    reflectance_of_1
     """.split()  # noqa: SIM905
 )
 """What readers follow beside `frames`, and nowhere else."""

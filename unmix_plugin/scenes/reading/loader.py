@@ -104,7 +104,7 @@ def _read_truth(root: Path, entry: SceneEntry, options: SceneOptions, faults: Fa
     names, illuminant, endmembers, bands = entry.materials, None, None, entry.wavelengths_nm
     if light_path is not None and bands is not None:
         try:
-            illuminant = illuminant_power(light_path, Bands(bands))
+            illuminant = illuminant_power(light_path, Bands(bands)) / (entry.reflectance_of_1 or 1.0)
         except SpectrumError as error:
             faults.add("'illuminant_path'", str(error))
     if materials_path is not None and bands is not None:

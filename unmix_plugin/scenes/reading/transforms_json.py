@@ -240,6 +240,9 @@ class SceneEntry:
     """How the poses were moved from where they come from."""
     value_scale: float | None = None
     """What cubes are divided by, where the options don't say."""
+    reflectance_of_1: float | None = None
+    """Reflectance that 1 stands for, where values are reflectances that were divided by it; in the light of the scene a
+    white is 1 over it."""
     metres_per_unit: float | None = None
     """Metres in a unit of the world that the poses come from."""
     fwhm_nm: Float64[np.ndarray, " B"] | None = None
@@ -273,6 +276,9 @@ def read_transforms(root: Path, faults: Faults, needs_cubes: bool = True) -> Sce
         illuminant_path=_read_text(content, "illuminant_path", FILE_NAME, faults),
         endmembers_path=_read_text(content, "endmembers_path", FILE_NAME, faults),
         value_scale=read_value_scale(content, faults),
+        reflectance_of_1=read_within(
+            content, "reflectance_of_1", 1e-30, 1e30, "a reflectance, above 0", FILE_NAME, faults
+        ),
         fwhm_nm=read_widths(content, faults),
         split_lists=read_split_lists(content, faults),
         frames=tuple(_read_frame(content, frame, i, faults, needs_cubes) for i, frame in enumerate(frames)),
