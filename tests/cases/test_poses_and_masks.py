@@ -219,36 +219,113 @@ def test_a_mask_that_is_not_found_is_missed(after, tmp_path):
     assert "view 0000 has no mask" in not_processed(*words, output=tmp_path / "scene")
 
 
-def test_the_poses_of_realitycapture_are_not_taken_for_others(tmp_path):
+@pytest.mark.parametrize("delimiter", [",", ";", "\t"])
+def test_the_poses_of_realitycapture_are_those_of_its_angles(delimiter, tmp_path):
     write_cubes(tmp_path)
-    rows = ["#cameras 5", "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2"]
+    head = "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2".replace(",", delimiter)
+    rows = ["#cameras 5", head]
     for name, pose in zip(CUBES, ring(), strict=True):
         heading, pitch, roll = Rotation.from_matrix(pose[:3, :3]).as_euler("ZXY", degrees=True)
-        entries = *pose[:3, 3], -heading, pitch, roll, 45 * 36 / WIDTH, *[0] * 8
-        rows.append(f"{name}.png," + ",".join(f"{one:.9f}" for one in entries))
+        entries = *pose[:3, 3], -heading, pitch, roll, FOCAL_PX * 36 / WIDTH, 0.5, -0.25, 0.1, *[0] * 5
+        cells = [f"{one:.9f}".replace(".", "." if delimiter == "," else ",") for one in entries]
+        rows.append(delimiter.join([f"{name}.png", *cells]))
     (tmp_path / "rc.csv").write_text("\n".join(rows) + "\n")
+    scene = processed("cubes", "--data", tmp_path, "--poses", "rc.csv", output=tmp_path / "scene")
+    assert len(scene.views) == VIEWS
+    scene.check_poses(pose_of)
+    lens = scene.views[0].entries
+    per_mm = WIDTH / 36
+    expected = FOCAL_PX, WIDTH / 2 + 0.5 * per_mm, HEIGHT / 2 - 0.25 * per_mm, 0.1
+    np.testing.assert_allclose([lens[key] for key in ("fl_x", "cx", "cy", "k1")], expected, atol=1e-5)
+
+
+def test_another_table_of_realitycapture_is_refused_with_the_one_to_export(tmp_path):
+    write_cubes(tmp_path)
+    rows = "".join(f"{name}.png,1,2,{index},0,0,{index}\n" for index, name in enumerate(CUBES))
+    (tmp_path / "rc.csv").write_text(f"#name,x,y,alt,heading,pitch,roll\n{rows}")
     words = "cubes", "--data", tmp_path, "--poses", "rc.csv"
-    assert "rc.csv holds no poses that we know" in not_processed(*words, output=tmp_path / "scene")
+    assert "Internal/External camera parameters" in not_processed(*words, output=tmp_path / "scene")
 
 
-def test_lenses_of_metashape_whose_place_is_not_read_are_named(tmp_path):
+@pytest.mark.parametrize("place", ["keyframes/corrected_cameras", "cameras"])
+def test_cameras_of_polycam_are_read(place, tmp_path):
+    write_cubes(tmp_path)
+    (tmp_path / place).mkdir(parents=True)
+    for name, pose in zip(CUBES, ring(), strict=True):
+        camera = {f"t_{row}{column}": float(pose[row, column]) for row in range(3) for column in range(4)}
+        camera |= {
+            "fx": FOCAL_PX,
+            "fy": FOCAL_PX,
+            "cx": WIDTH / 2,
+            "cy": HEIGHT / 2,
+            "width": WIDTH,
+            "height": HEIGHT,
+        }
+        (tmp_path / place / f"{name}.json").write_text(json.dumps(camera))
+    scene = processed("cubes", "--data", tmp_path, "--poses", tmp_path, output=tmp_path / "scene")
+    assert len(scene.views) == VIEWS
+    scene.check_poses(pose_of)
+
+
+BESIDE = np.eye(4)
+BESIDE[:3, :3] = Rotation.from_euler("yx", [12, -3], degrees=True).as_matrix()
+BESIDE[:3, 3] = [0.35, 0.03, -0.02]
+
+
+def write_metashape_rig(path: Path, offset: str, master_sensor: int = 0, scale: float = 1.0) -> None:
+    """A system of two cameras whose shots have a matrix of the camera of one sensor alone."""
+    shots, cv = "", np.diag([1.0, -1, -1, 1])
+    for index, pose in enumerate(ring()):
+        matrix = pose @ cv @ (BESIDE if master_sensor else np.eye(4))
+        turned = " ".join(f"{one:.12g}" for one in matrix.ravel())
+        for sensor, lens in enumerate("LR"):
+            camera = 2 * index + sensor
+            own = "" if sensor == master_sensor else f' master_id="{2 * index + master_sensor}"'
+            inner = "" if own else f"<transform>{turned}</transform>"
+            shots += (
+                f'<camera id="{camera}" sensor_id="{sensor}"{own} label="{lens}_{index:03d}">{inner}</camera>'
+            )
+    size = f'<resolution width="{WIDTH}" height="{HEIGHT}"/>'
+    lens = f'{size}<calibration type="frame" class="adjusted">{size}<f>{FOCAL_PX}</f><cx>0</cx><cy>0</cy></calibration>'
+    path.write_text(
+        '<?xml version="1.0" encoding="UTF-8"?><document version="2.0.0"><chunk label="1" enabled="true">'
+        f"<transform><scale>{scale}</scale></transform><sensors>"
+        f'<sensor id="0" type="frame">{lens}</sensor><sensor id="1" type="frame" master_id="0">{lens}{offset}</sensor>'
+        f"</sensors><cameras>{shots}</cameras></chunk></document>"
+    )
+
+
+def text_of(numbers: np.ndarray) -> str:
+    return " ".join(f"{one:.12g}" for one in numbers.ravel())
+
+
+BOTH = f"<rotation>{text_of(BESIDE[:3, :3])}</rotation><location>{text_of(BESIDE[:3, 3])}</location>"
+
+
+@pytest.mark.parametrize("scale", [1.0, 2.5])
+@pytest.mark.parametrize("master_sensor", [0, 1])
+def test_lenses_of_metashape_stand_where_their_sensor_says(master_sensor, scale, tmp_path):
+    """The master of the shots may be the other camera than that of the sensors."""
+    names = [f"{lens}_{index:03d}" for index in range(VIEWS) for lens in "LR"]
+    write_cubes(tmp_path, names)
+    write_metashape_rig(tmp_path / "cameras.xml", BOTH, master_sensor, scale)
+    scene = processed("cubes", "--data", tmp_path, "--poses", "cameras.xml", output=tmp_path / "scene")
+    assert {view.name for view in scene.views} == set(names)
+    cv = np.diag([1.0, -1, -1, 1])
+
+    def true_pose(name):
+        pose = ring()[int(name[2:])] @ cv @ (BESIDE if name[0] == "R" else np.eye(4)) @ cv
+        pose[:3, 3] *= scale
+        return pose
+
+    scene.check_poses(true_pose)
+
+
+def test_lenses_of_metashape_whose_place_is_not_written_are_named(tmp_path):
     """Their views are left out rather than put where the first lens of the system is."""
     names = [f"{lens}_{index:03d}" for index in range(VIEWS) for lens in "LR"]
     write_cubes(tmp_path, names)
-    shots = ""
-    for index, pose in enumerate(ring()):
-        turned = " ".join(f"{one:.12g}" for one in (pose @ np.diag([1.0, -1, -1, 1])).ravel())
-        shots += f'<camera id="{2 * index}" sensor_id="0" label="L_{index:03d}">'
-        shots += f"<transform>{turned}</transform></camera>"
-        shots += f'<camera id="{2 * index + 1}" sensor_id="1" master_id="{2 * index}" label="R_{index:03d}"/>'
-    size = f'<resolution width="{WIDTH}" height="{HEIGHT}"/>'
-    lens = f'{size}<calibration type="frame" class="adjusted">{size}<f>{FOCAL_PX}</f><cx>0</cx><cy>0</cy></calibration>'
-    (tmp_path / "cameras.xml").write_text(
-        '<?xml version="1.0" encoding="UTF-8"?><document version="2.0.0"><chunk label="1" enabled="true"><sensors>'
-        f'<sensor id="0" type="frame">{lens}</sensor><sensor id="1" type="frame" master_id="0">{lens}'
-        "<rotation>1 0 0 0 1 0 0 0 1</rotation><location>0.35 0 0</location></sensor></sensors>"
-        f"<cameras>{shots}</cameras></chunk></document>"
-    )
+    write_metashape_rig(tmp_path / "cameras.xml", "")
     scene = processed("cubes", "--data", tmp_path, "--poses", "cameras.xml", output=tmp_path / "scene")
     assert {view.name for view in scene.views} == {f"L_{index:03d}" for index in range(VIEWS)}
     scene.check_poses(pose_of)

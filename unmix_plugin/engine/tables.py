@@ -116,6 +116,35 @@ def possible_dialects(lines: Sequence[str], delimiter: str | None = None) -> lis
     ]
 
 
+_DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+(?:e[+-]?\d+)?", re.IGNORECASE)
+
+
+def named_rows(text: str, names: Sequence[str]) -> tuple[Dialect, list[tuple[int, dict[str, str]]]] | None:
+    """The rows below the first line that has all of these names, in small letters, each with the number of its line and
+    its cells by their head; and the dialect of their numbers. None where no line has them.
+
+    Raises:
+        csv.Error: it is no table.
+    """
+    lines, delimiter = text_lines(text)
+    for dialect in possible_dialects(lines, delimiter):
+        head: list[str] | None = None
+        found: list[tuple[int, dict[str, str]]] = []
+        for line, cells in dialect.rows(lines):
+            if head is not None:
+                found.append((line, dict(zip(head, cells, strict=False))))
+            elif set(names) <= (heads := {cell.lower().lstrip("# ") for cell in cells}) and len(heads) == len(
+                cells
+            ):
+                head = [cell.lower().lstrip("# ") for cell in cells]
+        if head is not None:
+            is_comma = dialect.delimiter != "," and any(
+                _DECIMAL_COMMA.fullmatch(cell) for _, row in found for cell in row.values()
+            )
+            return Dialect(dialect.delimiter, "," if is_comma else "."), found
+    return None
+
+
 def csv_bytes(rows: Iterable[Sequence[object]]) -> bytes:
     """A table as the bytes of a CSV file; numbers come as text in the precision wanted.
 

@@ -283,3 +283,27 @@ def load_xml(path: Path) -> ElementTree.Element:
         return parse_xml(read_table(path))
     except ValueError as error:
         raise CaptureError(f"{path} is not valid XML ({error}); was it cut short?") from error
+
+
+def numbers_in(
+    element: ElementTree.Element | None, count: int, where: str
+) -> Float64[np.ndarray, " count"] | None:
+    """Numbers in the text of an element; None without an element or text, CaptureError for other than `count` finite
+    ones."""
+    if element is None or not (element.text or "").strip():
+        return None
+    texts = (element.text or "").split()
+    try:
+        values = np.array([float(text) for text in texts])
+    except ValueError:
+        values = np.full(count, np.nan)
+    if len(texts) != count or not np.isfinite(values).all():
+        found = " ".join(texts)[:60]
+        raise CaptureError(f"{where}: <{element.tag}> holds {found!r}; expected {count} finite numbers")
+    return values
+
+
+def number_in(parent: ElementTree.Element, tag: str, where: str, default: float = 0.0) -> float:
+    """The number in a child; the default without one."""
+    values = numbers_in(parent.find(tag), 1, where)
+    return default if values is None else float(values[0])

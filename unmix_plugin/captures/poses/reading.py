@@ -18,7 +18,10 @@ from unmix_plugin.captures.names import BY_ORDER, path_text
 from unmix_plugin.captures.poses import lens as models
 from unmix_plugin.captures.poses.colmap import find_models, is_model, read_colmap
 from unmix_plugin.captures.poses.lens import Lens, bent_lens
+from unmix_plugin.captures.poses.metashape import read_metashape
+from unmix_plugin.captures.poses.micmac import find_orientations, read_micmac
 from unmix_plugin.captures.poses.opensfm import read_opensfm
+from unmix_plugin.captures.poses.polycam import find_polycam, is_polycam, read_polycam
 from unmix_plugin.captures.poses.pose_set import (
     FLIP,
     PosedCamera,
@@ -29,7 +32,7 @@ from unmix_plugin.captures.poses.pose_set import (
     make_pose_set,
     reading,
 )
-from unmix_plugin.captures.poses.xml_cameras import find_orientations, read_metashape, read_micmac
+from unmix_plugin.captures.poses.realitycapture import is_realitycapture, read_realitycapture
 from unmix_plugin.errors import CaptureError, counted, name_some
 from unmix_plugin.formats.meshes import read_ply_points
 from unmix_plugin.limits import open_regular
@@ -41,8 +44,8 @@ from unmix_plugin.scenes.reading.images import FORMATS
 from unmix_plugin.scenes.reading.lenses import Intrinsics, read_lens
 
 _KNOWN = (
-    "transforms.json, a COLMAP model (.bin or .txt), Metashape's cameras as XML, OpenSfM's reconstruction.json, "
-    "MicMac's Orientation-*.xml or LLFF's poses_bounds.npy"
+    "transforms.json, a COLMAP model (.bin or .txt), Metashape's cameras as XML, RealityCapture's camera parameters as "
+    "CSV, OpenSfM's reconstruction.json, MicMac's Orientation-*.xml, Polycam's cameras or LLFF's poses_bounds.npy"
 )
 _SPLIT_FILES = tuple(f"transforms_{split}.json" for split in ("train", "val", "eval", "test"))
 _LLFF_FILE, _LLFF_PICTURES = "poses_bounds.npy", ("images", "exr")
@@ -73,12 +76,16 @@ def _read_file(path: Path, given: Mapping[str, _Size]) -> PoseSet:
         return _read_xml(path)
     if start.startswith(b"\x93NUMPY"):
         return _read_llff(path)
+    if is_realitycapture(start):
+        return read_realitycapture(path, given)
     hint = ": export the cameras as XML" if path.suffix in (".psx", ".psz") else ""
     raise CaptureError(f"{path} holds no poses that we know; expected {_KNOWN}{hint}")
 
 
 def _read_json(path: Path, given: Mapping[str, _Size]) -> PoseSet:
     content = load_json(path)
+    if is_polycam(content):
+        return read_polycam(find_polycam(path.parent) or [path])
     return read_transforms({path: content}, given) if _has_frames(content) else read_opensfm(path, content)
 
 
@@ -110,6 +117,10 @@ def _read_folder(folder: Path, given: Mapping[str, _Size]) -> PoseSet:
         found.append(("MicMac's orientations", lambda: read_micmac(orientations)))
     elif sheets := [path for path in sorted(folder.glob("*.xml")) if b"<document" in _first_bytes(path)]:
         found.append((sheets[0].name, lambda: _read_xml(sheets[0])))
+    if tables := [path for path in sorted(folder.glob("*.csv")) if is_realitycapture(_first_bytes(path))]:
+        found.append((tables[0].name, lambda: read_realitycapture(tables[0], given)))
+    if phone := find_polycam(folder):
+        found.append(("Polycam's cameras", lambda: read_polycam(phone)))
     if not found:
         raise CaptureError(f"{folder} holds no poses that we know; expected {_KNOWN}")
     (name, read), *others = found
