@@ -155,7 +155,7 @@ def timed_step(trainer: Trainer, step: int) -> StepCost:
     synchronise(trainer)
     wall, cpu = time.perf_counter(), time.process_time()
     outputs, losses, _ = trainer.pipeline.get_train_loss_dict(step)
-    trainer.optimizer.zero_grad(set_to_none=True)
+    trainer.optimizer.zero_grad()
     torch.stack(list(losses.values())).sum().backward()
     trainer.optimizer.step()
     run_callbacks(trainer.callbacks, TrainingCallbackLocation.AFTER_TRAIN_ITERATION, step, 1.0)

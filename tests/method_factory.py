@@ -16,7 +16,7 @@ from unmix_plugin.field import CoefficientField
 from unmix_plugin.losses.comparison import ComparedPixels
 from unmix_plugin.model import TrainingBatch, UnmixModel
 from unmix_plugin.poses.training import CorrectedRays
-from unmix_plugin.rendering.renderer import RenderedRays, _VisibleSamples
+from unmix_plugin.rendering.renderer import RenderedRays
 from unmix_plugin.sensors.batches import from_batch
 from unmix_plugin.settings import RendererConfig, UnmixFieldConfig, UnmixModelConfig
 from unmix_plugin.spectral.materials import Coefficients
@@ -109,9 +109,8 @@ def losses_of(
     count, none = len(spectra), torch.zeros(0)
     abundances = torch.zeros(count, model.num_endmembers) if abundances is None else abundances
     nothing = Coefficients(torch.zeros(count, 2), 0)
-    visible = object.__new__(_VisibleSamples)  # only what is learnt without gradients looks at them
     sums = torch.tensor(sparsity), torch.tensor(certainty)
-    rendered = RenderedRays(nothing, abundances, 0, *sums, torch.zeros(0, 3), none, none.long(), visible)
+    rendered = RenderedRays(nothing, abundances, *sums, torch.zeros(0, 3), none, none.long(), ())
     [measured] = from_batch({"pixels": torch.arange(count), **batch}, count, model.seen_by.num_channels)
     compared = ComparedPixels(measured, 1.0, slice(0, count, 1), spectra, opacities, abundances)
     return model.losses(TrainingBatch(CorrectedRays(make_rays(count)), rendered, [compared]))

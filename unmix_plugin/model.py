@@ -43,6 +43,7 @@ from unmix_plugin.operators.occupancy import OccupancyGrid
 from unmix_plugin.poses.refinement import PoseRefinement
 from unmix_plugin.poses.training import CorrectedRays, PoseTraining
 from unmix_plugin.presets import AlphaPreset, choose, preset_for
+from unmix_plugin.rendering.front_to_back import composite_view
 from unmix_plugin.rendering.grid_upkeep import GRID_INTERVAL, update_grid
 from unmix_plugin.rendering.published_field import PublishedField
 from unmix_plugin.rendering.renderer import RenderedRays, VolumeRenderer
@@ -287,15 +288,15 @@ class UnmixModel(Model):
         if self._renderer is None or self._renderer.skips is not self.grid.skips:
             config = self.config
             self._renderer = VolumeRenderer(
-                self.scene_box.to(self.device),
-                self.grid.skips,
-                self.grid.reachable,
-                self.step,
-                float(config.renderer.smallest_weight),
-                self.is_unbounded,
-                config.losses.background == "last",
-                self.rays_per_chunk,
-                self.grid.opaque_skips,
+                box=self.scene_box.to(self.device),
+                skips=self.grid.skips,
+                reachable=self.grid.reachable,
+                step=self.step,
+                smallest_weight=float(config.renderer.smallest_weight),
+                is_unbounded=self.is_unbounded,
+                residual_on_last_sample=config.losses.background == "last",
+                rays_per_chunk=self.rays_per_chunk,
+                opaque_skips=self.grid.opaque_skips,
             )
         return self._renderer
 
@@ -378,7 +379,8 @@ class UnmixModel(Model):
             num_rays = len(views) * self.processes.count
             self.grid.visibility.record(rendered.positions, own, is_seen, num_rays)
         if self.grid.observed is not None:
-            positions, densities = map(rendered.visible.all_of, ("positions", "densities"))
+            positions = torch.cat([part.positions for part in rendered.evaluated])
+            densities = torch.cat([part.densities for part in rendered.evaluated])
             self.grid.record_observed(self.renderer.space.to_unit(positions.detach()), densities)
         self.comparison.update(step.compared)
         self._pose_training.update(step.compared, step.corrected)
@@ -399,7 +401,7 @@ class UnmixModel(Model):
 
         For evaluation while training; `trained.TrainedScene` has all other outputs.
         """
-        seen = self.renderer.composite_view(self.field, camera, self.metadata["subpixels"])
+        seen = composite_view(self.renderer, self.field, camera, self.metadata["subpixels"])
         linear = self.materials.through(seen, self.rgb_weights).clamp(0, 1)
         found = {
             "spectral": self.materials.spectra(seen),

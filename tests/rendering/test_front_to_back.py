@@ -13,6 +13,7 @@ from tests.rendering.test_unbounded import rays as rays_without_end
 from tests.scenes.scene_factory import make_scene
 from unmix_plugin.presets import WITH_ALPHA
 from unmix_plugin.rendering import front_to_back
+from unmix_plugin.rendering.front_to_back import composite
 
 
 def textured(smallest_weight: float, opacity: float):
@@ -28,7 +29,7 @@ def test_with_nothing_left_out_both_ways_are_equal(opacity):
     bundle = rays(40)
     with torch.no_grad():
         careful = renderer.render(field, bundle).coefficients.packed
-    assert_close(renderer.composite(field, bundle).packed, careful, rtol=1e-4, atol=1e-5)
+    assert_close(composite(renderer, field, bundle).packed, careful, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("at_once", [front_to_back.FEWEST_SAMPLES, front_to_back.SAMPLES_MARCHED])
@@ -42,7 +43,7 @@ def test_what_is_left_out_costs_no_more_than_in_the_careful_way(monkeypatch, sma
     with torch.no_grad():
         careful = renderer.render(field, bundle).coefficients
         exact = replace(renderer, smallest_weight=0.0).render(field, bundle).coefficients.packed
-    fast = renderer.composite(field, bundle)
+    fast = composite(renderer, field, bundle)
     assert_close(fast.abundances.sum(-1), fast.accumulation)
     unit = torch.ones_like(exact[0])
     unit[1] = 3.0  # distances: of the middle of the box
@@ -62,7 +63,7 @@ def test_a_ray_ends_where_no_sample_can_count_any_more(monkeypatch):
     monkeypatch.setattr(type(field), "encode", counted)
     with torch.no_grad():
         field.table.zero_()
-    found = renderer.composite(field, rays(50))
+    found = composite(renderer, field, rays(50))
     assert sum(looked_at) == 50 * front_to_back.FEWEST_SAMPLES
     assert_close(found.accumulation, torch.full((50,), 1 - 0.1**3))
 
@@ -76,7 +77,7 @@ def test_no_ray_is_more_opaque_than_it_is_however_little_light_is_left(monkeypat
     bundle = rays(200)
     with torch.no_grad():
         exact = replace(renderer, smallest_weight=0.0).render(field, bundle).coefficients.accumulation
-    found = renderer.composite(field, bundle).accumulation
+    found = composite(renderer, field, bundle).accumulation
     assert (found <= exact + 1e-5).all()
 
 
@@ -85,7 +86,7 @@ def test_rays_that_miss_see_nothing(residual):
     renderer, field = make()
     bundle = rays(3)
     away = replace(bundle, directions=-bundle.directions)
-    found = replace(renderer, residual_on_last_sample=residual).composite(field, away)
+    found = composite(replace(renderer, residual_on_last_sample=residual), field, away)
     assert found.packed.shape[0] == 3
     assert (found.packed == 0).all()
 
@@ -97,7 +98,7 @@ def test_the_last_sample_takes_all_the_light_that_is_left_as_in_the_careful_way(
     bundle = rays(40)
     with torch.no_grad():
         careful = renderer.render(field, bundle).coefficients
-    found = renderer.composite(field, bundle)
+    found = composite(renderer, field, bundle)
     assert_close(found.packed, careful.packed, rtol=1e-4, atol=1e-5)
     assert_close(found.accumulation, torch.ones(40))
 
@@ -108,7 +109,7 @@ def test_a_world_without_end_and_its_sky_are_those_of_the_careful_way(density):
     bundle = rays_without_end(30)
     with torch.no_grad():
         careful = renderer.render(field, bundle).coefficients.packed
-    assert_close(renderer.composite(field, bundle).packed, careful, rtol=1e-3, atol=1e-4)
+    assert_close(composite(renderer, field, bundle).packed, careful, rtol=1e-3, atol=1e-4)
 
 
 def test_pictures_of_a_trained_scene_are_those_of_the_careful_renderer(tmp_path):
@@ -120,7 +121,7 @@ def test_pictures_of_a_trained_scene_are_those_of_the_careful_renderer(tmp_path)
     smallest = WITH_ALPHA.smallest_weight
     exactly, quickly = (replace(model.renderer, smallest_weight=weight) for weight in (0.0, smallest))
     with torch.no_grad():
-        exact, found = exactly.render(model.field, rays).coefficients, quickly.composite(model.field, rays)
+        exact, found = exactly.render(model.field, rays).coefficients, composite(quickly, model.field, rays)
         errors = (model.materials.spectra(found) - model.materials.spectra(exact)).abs()
     assert float(exact.accumulation.max()) > 0.8
     assert 0 < float(errors.square().mean().sqrt()) < 1e-3

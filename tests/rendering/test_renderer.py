@@ -15,7 +15,8 @@ from unmix_plugin.operators.marching import PackedSamples
 from unmix_plugin.operators.occupancy import skip_distances
 from unmix_plugin.presets import WITH_ALPHA, WITHOUT_ALPHA
 from unmix_plugin.rendering import renderer as rendering
-from unmix_plugin.rendering.renderer import VolumeRenderer, _visible_samples
+from unmix_plugin.rendering.front_to_back import composite
+from unmix_plugin.rendering.renderer import VisibleSamples, VolumeRenderer, visible_samples
 from unmix_plugin.settings import RendererConfig, UnmixFieldConfig
 
 PIXEL = 0.1
@@ -73,7 +74,7 @@ def test_sparsity_counts_the_samples_that_density_is_spread_over(density):
     assert float(spread) == pytest.approx(expected, rel=0.05)
 
 
-def test_a_softmax_that_is_sure_still_learns_that_it_should_not_be():
+def test_a_softmax_that_is_sure_still_learns_that_it_should_not_be(monkeypatch):
     """The certainty of even abundances is the opacity times log K; where one share is 1, its gradient stays."""
     renderer, field = make(depth=PIXEL / 1.5)
     bundle = rays(20)
@@ -82,8 +83,15 @@ def test_a_softmax_that_is_sure_still_learns_that_it_should_not_be():
         opacity = rendered.coefficients.accumulation.mean()
         assert_close(rendered.certainty, opacity * math.log(field.num_endmembers))
     logits = torch.tensor([[0.0, 40.0, 5.0]], requires_grad=True)
-    (-rendering._mean_log(logits.softmax(dim=1)).sum()).backward()
-    assert_close(logits.grad, torch.tensor([[-1 / 3, 2 / 3, -1 / 3]]))
+    outputs = field.get_outputs
+
+    def surely(positions, *others):
+        abundances = logits.softmax(dim=1).expand(len(positions), -1)
+        return {**outputs(positions, *others), "abundances": abundances}
+
+    monkeypatch.setattr(field, "get_outputs", surely)
+    renderer.render(field, bundle).certainty.backward()
+    assert_close(logits.grad, opacity * torch.tensor([[-1 / 3, 2 / 3, -1 / 3]]))
 
 
 def test_without_alpha_an_untrained_scene_can_grow_dense_along_the_whole_of_a_ray():
@@ -102,8 +110,8 @@ def test_without_alpha_an_untrained_scene_can_grow_dense_along_the_whole_of_a_ra
 def test_rays_rendered_in_chunks_are_those_rendered_together():
     renderer, field = make()
     bundle = rays(20)
-    together = replace(renderer, rays_per_chunk=20).composite(field, bundle)
-    assert_close(renderer.composite(field, bundle).packed, together.packed)
+    together = composite(replace(renderer, rays_per_chunk=20), field, bundle)
+    assert_close(composite(renderer, field, bundle).packed, together.packed)
 
 
 def test_rendering_changes_nothing_and_draws_nothing_from_the_global_generator():
@@ -142,6 +150,10 @@ def test_impossible_settings_are_refused(settings, message):
         RendererConfig(**settings)
 
 
+def num_evaluated(found: VisibleSamples) -> int:
+    return sum(len(part.densities) for part in found.evaluated)
+
+
 @pytest.mark.parametrize("smallest_weight", [0.0, 4e-3, 0.2])
 @pytest.mark.parametrize("opacity", [1e-4, 0.05, 0.9])
 @pytest.mark.parametrize("at_first", [rendering._FIRST_SAMPLES, rendering._FIRST_ON_GPU])
@@ -152,16 +164,16 @@ def test_samples_found_from_the_front_are_those_of_all(monkeypatch, smallest_wei
     with torch.no_grad():
         field.table.normal_(std=3.0, generator=torch.Generator().manual_seed(2))
         samples = samples_of(renderer, bundle)
-        found = _visible_samples(field, samples, bundle, step, smallest_weight)
+        found = visible_samples(field, samples, bundle, step=step, smallest_weight=smallest_weight)
         encoded = field.encode(rendering._points_of(samples, bundle)[0])
         densities, features = field.density_of(encoded)
         keep = volume_weights(densities * step, samples.packed_info) > smallest_weight
     assert torch.equal(found.samples.t, samples.t[keep])
     assert torch.equal(found.samples.packed_info, samples.select(keep).packed_info)
-    assert torch.equal(found.of("encoded"), encoded[keep])
-    assert_close(found.of("densities"), densities[keep])
-    assert_close(found.of("features"), features[keep])
-    assert found.num_evaluated <= len(samples)
+    assert torch.equal(found.of([part.encoded for part in found.evaluated]), encoded[keep])
+    assert_close(found.of([part.densities for part in found.evaluated]), densities[keep])
+    assert_close(found.of([part.features for part in found.evaluated]), features[keep])
+    assert num_evaluated(found) <= len(samples)
 
 
 def test_what_lies_behind_an_opaque_front_is_not_evaluated_and_rays_that_miss_have_no_samples():
@@ -169,13 +181,19 @@ def test_what_lies_behind_an_opaque_front_is_not_evaluated_and_rays_that_miss_ha
     bundle = rays(30)
     with torch.no_grad():
         samples = samples_of(renderer, bundle)
-        found = _visible_samples(field, samples, bundle, renderer.step, renderer.smallest_weight)
-    assert found.num_evaluated == 30 * 8
-    assert len(samples) > 10 * found.num_evaluated
+        found = visible_samples(
+            field, samples, bundle, step=renderer.step, smallest_weight=renderer.smallest_weight
+        )
+    assert num_evaluated(found) == 30 * 8
+    assert len(samples) > 10 * num_evaluated(found)
     assert len(found.samples) == 30
     away = replace(bundle, directions=-bundle.directions)
-    found = _visible_samples(field, samples_of(renderer, away), away, renderer.step, 0.1)
-    assert (len(found.samples), len(found.of("encoded")), found.num_evaluated) == (0, 0, 0)
+    found = visible_samples(field, samples_of(renderer, away), away, step=renderer.step, smallest_weight=0.1)
+    assert (
+        len(found.samples),
+        len(found.of([part.encoded for part in found.evaluated])),
+        num_evaluated(found),
+    ) == (0, 0, 0)
 
 
 def test_a_picture_without_gradients_is_that_with_them():

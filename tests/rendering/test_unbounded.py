@@ -13,6 +13,7 @@ from unmix_plugin.engine.processes import Processes
 from unmix_plugin.field import FieldSpace, UnmixField
 from unmix_plugin.operators.compositing import scale_gradient
 from unmix_plugin.operators.occupancy import OccupancyGrid, skip_distances
+from unmix_plugin.rendering.front_to_back import composite
 from unmix_plugin.rendering.grid_upkeep import update_grid
 from unmix_plugin.rendering.renderer import VolumeRenderer
 from unmix_plugin.settings import UnmixFieldConfig
@@ -179,7 +180,7 @@ def test_a_bounded_field_has_a_sky_behind_all_matter_only_where_there_is_a_backd
     bundle = rays(20)
     with torch.no_grad():
         found = renderer.render(field, bundle)
-        quick = renderer.composite(field, bundle)
+        quick = composite(renderer, field, bundle)
         sky = field.sky(bundle)
     assert field.has_sky
     assert sky is not None

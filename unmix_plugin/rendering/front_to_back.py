@@ -1,8 +1,9 @@
 """What rays sum to, without gradients: samples are evaluated from the front until no more light gets through.
 
 For pictures of a trained field. `VolumeRenderer.render` is what training takes: it first evaluates the density of every
-sample. Both end a ray where its transmittance is no more than the smallest weight of a sample, behind which no sample
-can count; so opacities are the same. Here neighbouring samples are merged where together they carry little light.
+sample that light may reach. Both end a ray where its transmittance is no more than the smallest weight of a sample,
+behind which no sample can count; so opacities are the same. Here neighbouring samples are merged where together they
+carry little light.
 
 As many rays are active at once as keep the processor busy: those that end make room for others.
 
@@ -11,23 +12,20 @@ Notation: `R` rays, `A` active ones, `M` samples of each that are marched at onc
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.field import CoefficientField
 from unmix_plugin.operators.compositing import accumulate
 from unmix_plugin.operators.marching import packed_rows
 from unmix_plugin.operators.merging import MergedSamples, MergeLimits, merge_samples
+from unmix_plugin.rendering.renderer import VolumeRenderer, before_sky, coefficients_of
 from unmix_plugin.spectral.materials import Coefficients
-
-if TYPE_CHECKING:
-    from unmix_plugin.rendering.renderer import VolumeRenderer
 
 _MERGED_WEIGHT = 125.0
 """Most of a ray's light that merged samples carry together, in multiples of the smallest weight of a sample."""
@@ -122,7 +120,32 @@ def _samples_at_once(like: Tensor) -> int:
 
 
 @torch.no_grad()
-def composite_front_to_back(
+def composite_view(
+    renderer: VolumeRenderer, field: CoefficientField, camera: Cameras, subpixels: int = 1
+) -> Coefficients:
+    """Coefficients (H, W, ...) of a whole view of one camera: every picture of it follows from them. So many rays
+    pass a pixel along each of its edges and are averaged: all outputs but ratios are linear."""
+    camera = camera.to(renderer.skips.device)
+    centres = [(i + 0.5) / subpixels for i in range(subpixels)]
+    total: Coefficients | None = None
+    for offset in [(x, y) for y in centres for x in centres]:
+        found = composite(renderer, field, camera.image_rays(0, offset))
+        total = found if total is None else found.map(total.packed.add_)
+    assert total is not None
+    return total.map(lambda packed: packed / subpixels**2).unflatten(camera.height, camera.width)
+
+
+@torch.no_grad()
+def composite(renderer: VolumeRenderer, field: CoefficientField, ray_bundle: RayBundle) -> Coefficients:
+    """Coefficients (R, ...) of each ray, few rays at a time in memory: those of `VolumeRenderer.render` but for what
+    this module says, in less time."""
+    found, chunk = _composite_foreground(renderer, field, ray_bundle), renderer.rays_per_chunk
+    parts = [field.sky(ray_bundle[first : first + chunk]) for first in range(0, len(ray_bundle), chunk)]
+    skies = [sky for sky in parts if sky is not None]
+    return before_sky(found, torch.cat(skies) if skies else None)[0]
+
+
+def _composite_foreground(
     renderer: VolumeRenderer, field: CoefficientField, ray_bundle: RayBundle
 ) -> Coefficients:
     """Coefficients (R, ...) of each ray of a field, before any sky."""
@@ -175,12 +198,6 @@ def _coefficients(
     positions = torch.addcmul(origins, along, t[:, None])
     light = renderer.lamplight(field, origins, positions)
     return coefficients_of(t, field.get_outputs(positions, along, features, light))
-
-
-def coefficients_of(t: Float[Tensor, "S"], outputs: Mapping[str, Tensor]) -> Coefficients:
-    """Those of opaque samples at these distances, of which a field says this."""
-    names = ("abundances", "scaled_abundances", "specular_coefficients")
-    return Coefficients.of(torch.ones_like(t), t, *(outputs[name] for name in names))
 
 
 def _lines(

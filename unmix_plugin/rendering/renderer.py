@@ -2,7 +2,8 @@
 
 Rays are marched through the occupied cells of a grid. A first pass without gradient, from the front until no light is
 left, finds the visible samples: those that contribute enough of their ray's light. Only these go through the heads and
-the backward pass. The cost of a sample doesn't depend on the number of bands.
+the backward pass. The cost of a sample doesn't depend on the number of bands. Pictures of a trained field are
+composited in front_to_back.py.
 
 Notation: `R` rays, `N` samples that light may reach, `S` visible ones, `K` endmembers, `J` specular coefficients;
 w_i = T_i (1 - exp(-sigma_i delta)).
@@ -10,14 +11,13 @@ w_i = T_i (1 - exp(-sigma_i delta)).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
-from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import RayBundle, SceneBox, UnitSpace
 from unmix_plugin.field import CoefficientField
 from unmix_plugin.light.shading import FINEST, Lamplight, ShadowDetail, lamplight
@@ -25,7 +25,6 @@ from unmix_plugin.operators.compositing import accumulate, scale_gradient, volum
 from unmix_plugin.operators.contracted_marching import rays_in_world
 from unmix_plugin.operators.marching import GridRays, PackedSamples, packed_rows, rays_in_box
 from unmix_plugin.operators.occupancy import cells_at
-from unmix_plugin.rendering.front_to_back import coefficients_of, composite_front_to_back
 from unmix_plugin.spectral.materials import Coefficients
 
 _SMALLEST_SHARE = 1e-30
@@ -35,35 +34,39 @@ _FIRST_SAMPLES, _FIRST_ON_GPU = 8, 32
 
 
 @dataclass(frozen=True)
-class _VisibleSamples:
-    """Samples that contribute enough, and what was found of them, without gradients."""
+class EvaluatedSamples:
+    """What was found at samples in model space, without gradients."""
+
+    positions: Float[Tensor, "N 3"]
+    encoded: Float[Tensor, "N LF"]
+    densities: Float[Tensor, "N"]
+    features: Float[Tensor, "N G"]
+
+
+@dataclass(frozen=True)
+class VisibleSamples:
+    """Samples that contribute enough of their ray's light, among all that light may reach."""
 
     samples: PackedSamples
-    num_evaluated: int
-    """N."""
     rows: Int[Tensor, "S"]
     """Of each, among the samples evaluated."""
-    evaluated: Mapping[str, list[Tensor]]
-    """Of the samples evaluated, in parts: their `positions` (3) in model space, how these are `encoded` (LF), and their
-    `densities` and geometry `features` (G)."""
+    evaluated: Sequence[EvaluatedSamples]
+    """All samples that light may reach, in the parts in which they were evaluated."""
 
-    def all_of(self, name: str) -> Float[Tensor, "N *_"]:
-        """Of all samples evaluated."""
-        return torch.cat(self.evaluated[name])
-
-    def of(self, name: str) -> Float[Tensor, "S *_"]:
-        """Of the samples that contribute enough."""
-        return self.all_of(name).index_select(0, self.rows)
+    def of(self, parts: Sequence[Float[Tensor, "_ *values"]]) -> Float[Tensor, "S *values"]:
+        """The values of the visible samples, from those of each part of the evaluated ones."""
+        return torch.cat(list(parts)).index_select(0, self.rows)
 
 
 @torch.no_grad()
-def _visible_samples(
+def visible_samples(
     field: CoefficientField,
     samples: PackedSamples,
     ray_bundle: RayBundle,
+    *,
     step: float,
     smallest_weight: float,
-) -> _VisibleSamples:
+) -> VisibleSamples:
     """Of samples of the rays that lie `step` apart those that contribute more than `smallest_weight` of their ray's
     light.
 
@@ -72,33 +75,25 @@ def _visible_samples(
     """
     starts, counts = samples.packed_info.unbind(-1)
     depths, rows = torch.zeros_like(samples.t), torch.zeros_like(samples.ray_indices)
-    evaluated: dict[str, list[Tensor]] = {
-        name: [] for name in ("positions", "encoded", "densities", "features")
-    }
-    first, num_seen, left = 0, 0, torch.ones_like(counts, dtype=samples.t.dtype)
+    evaluated: list[EvaluatedSamples] = []
+    first, num_evaluated, transmittance = 0, 0, torch.ones_like(counts, dtype=samples.t.dtype)
     at_first = _FIRST_SAMPLES if depths.device.type == "cpu" else _FIRST_ON_GPU
     while True:
-        wanted = (counts - first).clamp(0, max(first, at_first)) * (left > smallest_weight)
+        wanted = (counts - first).clamp(0, max(first, at_first)) * (transmittance > smallest_weight)
         rays, chosen, _ = packed_rows(starts + first, wanted)
-        if len(chosen) == 0 and evaluated["positions"]:
+        if len(chosen) == 0 and evaluated:
             break
-        part = samples.rows(chosen)
-        positions = _points_of(part, ray_bundle)[0]
+        positions, _ = _points_of(samples.rows(chosen), ray_bundle)
         encoded = field.encode(positions)
         densities, features = field.density_of(encoded)
-        found = {"positions": positions, "encoded": encoded, "densities": densities, "features": features}
-        for name, values in found.items():
-            evaluated[name].append(values)
+        evaluated.append(EvaluatedSamples(positions, encoded, densities, features))
         depths[chosen] = densities * step
-        rows[chosen] = torch.arange(num_seen, num_seen + len(chosen), device=rows.device)
-        left = left * torch.exp(-torch.zeros_like(left).index_add_(0, rays, densities * step))
-        first, num_seen = first + max(first, at_first), num_seen + len(chosen)
+        rows[chosen] = torch.arange(num_evaluated, num_evaluated + len(chosen), device=rows.device)
+        depth = torch.zeros_like(transmittance).index_add_(0, rays, densities * step)
+        transmittance = transmittance * torch.exp(-depth)
+        first, num_evaluated = first + max(first, at_first), num_evaluated + len(chosen)
     keep = volume_weights(depths, samples.packed_info) > smallest_weight
-    return _VisibleSamples(samples.select(keep), num_seen, rows[keep], evaluated)
-
-
-def _mean_log(shares: Float[Tensor, "S K"]) -> Float[Tensor, "S"]:
-    return shares.clamp(min=_SMALLEST_SHARE).log().mean(dim=1)
+    return VisibleSamples(samples.select(keep), rows[keep], evaluated)
 
 
 def _points_of(
@@ -123,8 +118,6 @@ class RenderedRays:
     coefficients: Coefficients
     mixtures: Float[Tensor, "R K"]
     """Abundances of all that a ray sees, the sky included."""
-    num_samples: int
-    """Samples evaluated of all rays: those that light may reach."""
     sparsity: Float[Tensor, ""]
     """Sum of log(1 + tau / 0.03) over the samples of a ray that are visible, tau their optical depth; mean over rays.
     The same light stopped by few samples gives less of it than by many: surfaces little, floaters much."""
@@ -137,8 +130,13 @@ class RenderedRays:
     """Share of its ray's light that each contributes."""
     ray_indices: Int[Tensor, "S"]
     """Ray of each."""
-    visible: _VisibleSamples
-    """What is known of all samples that light may reach."""
+    evaluated: Sequence[EvaluatedSamples]
+    """All samples that light may reach."""
+
+    @property
+    def num_samples(self) -> int:
+        """Samples evaluated of all rays."""
+        return sum(len(part.densities) for part in self.evaluated)
 
 
 @dataclass(frozen=True)
@@ -173,13 +171,18 @@ class VolumeRenderer:
         """Composited coefficients of each ray; a generator shifts the samples of each at random, as in training."""
         origins, directions = ray_bundle.origins.detach(), ray_bundle.directions.detach()
         samples = self.march(origins, directions, torch.zeros_like(origins[:, 0]), generator).samples()
-        seen = _visible_samples(field, samples, ray_bundle, self.step, self.smallest_weight)
+        seen = visible_samples(
+            field, samples, ray_bundle, step=self.step, smallest_weight=self.smallest_weight
+        )
         kept = seen.samples
         positions, along = _points_of(kept, ray_bundle)
         if torch.is_grad_enabled():
-            densities, features = field.density_of(field.encode(positions, seen.of("encoded")))
+            encoded = seen.of([part.encoded for part in seen.evaluated])
+            densities, features = field.density_of(field.encode(positions, encoded))
         else:
-            densities, features = seen.of("densities"), seen.of("features")
+            densities = seen.of([part.densities for part in seen.evaluated])
+            features = seen.of([part.features for part in seen.evaluated])
+
         origins = ray_bundle.origins.index_select(0, kept.ray_indices)
         light = self.lamplight(field, origins, positions, generator)
         outputs = field.get_outputs(positions, along, features, light)
@@ -189,50 +192,30 @@ class VolumeRenderer:
             near = (kept.t / self.space.half_edge).square().clamp(max=1.0)
             densities = scale_gradient(densities, near)
             outputs = {name: scale_gradient(values, near[:, None]) for name, values in outputs.items()}
+
         depths = densities * self.step
         weights = volume_weights(depths, kept.packed_info)
         values = coefficients_of(kept.t, outputs)
         totals = accumulate(weights, values.packed, kept.packed_info)
-        if self.residual_on_last_sample:
-            totals = totals + _residual_transmittance(totals[:, 0], values.packed, kept)
-        matter = Coefficients(totals, values.num_endmembers)
-        coefficients, mixtures = _before_sky(matter, field.sky(ray_bundle))
+        if self.residual_on_last_sample and len(values.packed):
+            starts, counts = kept.packed_info.unbind(-1)
+            last = values.packed.index_select(0, (starts + counts - 1).clamp(min=0))
+            totals = totals + torch.where(counts > 0, 1 - totals[:, 0], 0.0)[:, None] * last
+        foreground = Coefficients(totals, values.num_endmembers)
+        coefficients, mixtures = before_sky(foreground, field.sky(ray_bundle))
+
+        num_rays = max(len(ray_bundle), 1)
+        mean_log = outputs["abundances"].clamp(min=_SMALLEST_SHARE).log().mean(dim=1)
         return RenderedRays(
             coefficients,
             mixtures,
-            seen.num_evaluated,
-            torch.log1p(depths / _SPARSE_DEPTH).sum() / max(len(ray_bundle), 1),
-            (weights.detach() * -_mean_log(outputs["abundances"])).sum() / max(len(ray_bundle), 1),
-            self.space.to_unit(positions).detach(),
-            weights,
-            kept.ray_indices,
-            seen,
+            sparsity=torch.log1p(depths / _SPARSE_DEPTH).sum() / num_rays,
+            certainty=(weights.detach() * -mean_log).sum() / num_rays,
+            positions=self.space.to_unit(positions).detach(),
+            weights=weights,
+            ray_indices=kept.ray_indices,
+            evaluated=seen.evaluated,
         )
-
-    @torch.no_grad()
-    def composite(self, field: CoefficientField, ray_bundle: RayBundle) -> Coefficients:
-        """Coefficients (R, ...) of each ray, few rays at a time in memory.
-
-        Those of `render` but for what front_to_back.py says, in less time.
-        """
-        found = composite_front_to_back(self, field, ray_bundle)
-        chunk = self.rays_per_chunk
-        parts = [field.sky(ray_bundle[first : first + chunk]) for first in range(0, len(ray_bundle), chunk)]
-        skies = [sky for sky in parts if sky is not None]
-        return _before_sky(found, torch.cat(skies) if skies else None)[0]
-
-    @torch.no_grad()
-    def composite_view(self, field: CoefficientField, camera: Cameras, subpixels: int = 1) -> Coefficients:
-        """Coefficients (H, W, ...) of a whole view of one camera: every picture of it follows from them. So many rays
-        pass a pixel along each of its edges and are averaged: all outputs but ratios are linear."""
-        camera = camera.to(self.skips.device)
-        centres = [(i + 0.5) / subpixels for i in range(subpixels)]
-        total: Coefficients | None = None
-        for offset in [(x, y) for y in centres for x in centres]:
-            found = self.composite(field, camera.image_rays(0, offset))
-            total = found if total is None else found.map(total.packed.add_)
-        assert total is not None
-        return total.map(lambda packed: packed / subpixels**2).unflatten(camera.height, camera.width)
 
     @torch.no_grad()
     def normals(
@@ -299,23 +282,18 @@ class VolumeRenderer:
         return rays_in_box(starts, along, torch.maximum(t_near, behind), t_far, jitter, self.skips, self.step)
 
 
-def _before_sky(
-    matter: Coefficients, sky: Float[Tensor, "R C"] | None
+def coefficients_of(t: Float[Tensor, "S"], outputs: Mapping[str, Tensor]) -> Coefficients:
+    """Those of opaque samples at these distances, of which a field says this."""
+    names = ("abundances", "scaled_abundances", "specular_coefficients")
+    return Coefficients.of(torch.ones_like(t), t, *(outputs[name] for name in names))
+
+
+def before_sky(
+    foreground: Coefficients, sky: Float[Tensor, "R C"] | None
 ) -> tuple[Coefficients, Float[Tensor, "R K"]]:
     """With the light of what is infinitely far away, as `CoefficientField.sky` gives it; and abundances with its."""
     if sky is None:
-        return matter, matter.abundances
-    left = (1 - matter.accumulation)[:, None]
-    mixtures = matter.abundances + left * sky[:, :-1]
-    return matter.with_light(left * sky[:, -1:] * sky[:, :-1]), mixtures
-
-
-def _residual_transmittance(
-    accumulation: Float[Tensor, "R"], values: Float[Tensor, "S C"], samples: PackedSamples
-) -> Float[Tensor, "R C"]:
-    """What the last sample of each ray adds if it takes all the light left; 0 for rays without samples."""
-    starts, counts = samples.packed_info.unbind(-1)
-    if len(values) == 0:
-        return values.new_zeros(len(starts), values.shape[1])
-    last = values.index_select(0, (starts + counts - 1).clamp(min=0))
-    return torch.where(counts > 0, 1 - accumulation, 0.0)[:, None] * last
+        return foreground, foreground.abundances
+    transmittance = (1 - foreground.accumulation)[:, None]
+    mixtures = foreground.abundances + transmittance * sky[:, :-1]
+    return foreground.with_light(transmittance * sky[:, -1:] * sky[:, :-1]), mixtures

@@ -31,6 +31,7 @@ from unmix_plugin.engine.geometry.key_poses import rotation_matrix
 from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.poses.refinement import LARGEST_STEP
 from unmix_plugin.poses.row_fitting import fit_rows, main_axes
+from unmix_plugin.rendering.front_to_back import composite
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.sensors.views import smooth_terms
 from unmix_plugin.trained.evaluation import PredictedView, ViewTruth, render_view, subpixels_for
@@ -241,7 +242,7 @@ class _Comparison:
         height, width = subpixels * self.camera.height, subpixels * self.camera.width
         cameras = [_moved(self.camera, step, self.scene) for step in steps]
         rays = [camera.resized(width, height).to(self.scene.device).image_rays(0) for camera in cameras]
-        found = self.scene.renderer.composite(self.scene.field, RayBundle.join(rays))
+        found = composite(self.scene.renderer, self.scene.field, RayBundle.join(rays))
         view = MaterialView(self.scene, cameras[0], found.unflatten(len(cameras) * height, width))
         opacity = view.opacity if self.truth.alpha is not None else torch.ones_like(view.opacity)
         seen = self.truth.seen(view["spectral"]).float()
@@ -301,7 +302,7 @@ def align_rows(scene: TrainedScene, camera: Cameras, truth: ViewTruth) -> Camera
 
     def look(rays: RayBundle, axes: Float[Tensor, "b C"]) -> Float[Tensor, "R D"]:
         matrix = axes if truth.sensor is None else torch.from_numpy(truth.sensor.matrix).to(axes).T @ axes
-        found = scene.renderer.composite(scene.field, rays)
+        found = composite(scene.renderer, scene.field, rays)
         seen = scene.materials.through(found, matrix)
         return seen if truth.alpha is None else torch.cat([seen, found.accumulation[:, None]], dim=1)
 

@@ -23,6 +23,7 @@ from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import RayBundle
+from unmix_plugin.rendering.front_to_back import composite
 from unmix_plugin.scenes.geometry.views import look_up
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION
@@ -144,7 +145,7 @@ class MeasuredScene:
         if not found:
             return ()
         joined = RayBundle.join(rays)
-        seen = as_trained.renderer.composite(as_trained.field, joined.to(as_trained.device))
+        seen = composite(as_trained.renderer, as_trained.field, joined.to(as_trained.device))
         distance = seen.ray_distance.where(seen.is_occupied, torch.inf).cpu()
         is_there = _ends_near(joined, distance, point, torch.stack(sizes))
         return tuple(pixel for pixel, is_near in zip(found, is_there.tolist(), strict=True) if is_near)

@@ -24,6 +24,7 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.formats.files import numbered_apart
+from unmix_plugin.rendering.front_to_back import composite
 from unmix_plugin.scenes.geometry.views import look_up
 from unmix_plugin.spectral.colour.conversion import describe_colour, rgb_matrix
 from unmix_plugin.spectral.colour.srgb import encode_srgb
@@ -182,7 +183,7 @@ def look_at(
     a lamp moves with the camera, `lit_head_on`."""
     indices = torch.zeros(len(positions), dtype=torch.int64)
     rays = RayBundle(positions - scene.pixel_size * directions, directions, indices).to(scene.device)
-    return scene.lit_head_on.renderer.composite(scene.field, rays)
+    return composite(scene.lit_head_on.renderer, scene.field, rays)
 
 
 def look_from_above(

@@ -22,6 +22,7 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.field import CoefficientField
+from unmix_plugin.rendering.front_to_back import composite_view
 from unmix_plugin.rendering.renderer import VolumeRenderer
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.bands import Bands
@@ -148,7 +149,7 @@ class TrainedScene:
     def look(self, camera: Cameras, subpixels: int | None = None) -> MaterialView:
         """Render a view; `subpixels` squared rays a pixel, None for as many as in training."""
         count = self.subpixels if subpixels is None else subpixels
-        return MaterialView(self, camera, self.renderer.composite_view(self.field, camera, count))
+        return MaterialView(self, camera, composite_view(self.renderer, self.field, camera, count))
 
     def render(self, camera: Cameras, names: Collection[str]) -> dict[str, Tensor]:
         """Outputs of a view by name, (H, W, ...); an unknown one is refused before anything is rendered."""

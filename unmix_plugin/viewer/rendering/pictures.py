@@ -20,6 +20,7 @@ from jaxtyping import Float32, UInt8
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.rendering.front_to_back import composite
 from unmix_plugin.spectral.materials import Coefficients, Materials
 from unmix_plugin.trained.model_scene import EstimatedScene, ModelView
 from unmix_plugin.trained.open_run import require_materials
@@ -137,7 +138,7 @@ class FrameRender:
         y, x = ((part + 0.5) / self._subpixels for part in divmod(turn, self._subpixels))
         coords = torch.stack([columns + x, rows + y], dim=-1).to(torch.float32)
         bundle = self.camera.to(scene.device).generate_rays(torch.zeros_like(pixels), coords)
-        block = scene.renderer.composite(scene.field, bundle)
+        block = composite(scene.renderer, scene.field, bundle)
         if self._coefficients is None:
             self._coefficients = block.map(lambda packed: packed.new_zeros(self._num_pixels, packed.shape[1]))
         self._coefficients.packed[pixels] += block.packed / self._subpixels**2
