@@ -17,12 +17,11 @@ from unmix_plugin.captures.poses.turntable_evidence import parse_angles
 from unmix_plugin.captures.wavelengths import parse_wavelengths
 from unmix_plugin.errors import ConfigError, SceneError, SpectrumError
 from unmix_plugin.formats.libraries import read_library
-from unmix_plugin.scenes.reading.checks import locate_files
 from unmix_plugin.scenes.reading.cubes import UnreadableArrayError, _measure_cube, read_array_header
+from unmix_plugin.scenes.reading.entries import locate_files, read_entries
 from unmix_plugin.scenes.reading.faults import Faults
 from unmix_plugin.scenes.reading.images import UnreadableImageError, read_colour, read_labels, read_mask
 from unmix_plugin.scenes.reading.splits import split_frames
-from unmix_plugin.scenes.reading.transforms_json import read_transforms
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.settings import SceneOptions
 from unmix_plugin.spectral.bands import Bands
@@ -77,13 +76,13 @@ def transforms_reader() -> Reader:
 
 def _read_transforms(path: Path) -> None:
     faults = Faults(path.parent)
-    entry = read_transforms(path.parent, faults)
+    entry = read_entries(path.parent, faults)
     locate_files(path.parent, entry, False, faults)
     for method in ("auto", "filename", "interval"):
         split_frames(entry, method, 2, faults)
     for frame in entry.frames:
-        if frame.intrinsics is not None:
-            focal = np.array(frame.intrinsics.focal_at(20, 30), dtype=np.float32)
+        if frame.camera.lens is not None:
+            focal = np.array(frame.camera.lens.focal_at(20, 30), dtype=np.float32)
             assert np.isfinite(focal).all()
             assert focal.min() > 0
     faults.raise_if_any()

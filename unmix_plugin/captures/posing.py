@@ -34,7 +34,8 @@ from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera, PoseSet, whe
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.engine.geometry.camera_paths import focus_point, meeting_point
 from unmix_plugin.errors import CaptureError, ConfigError, counted, did_you_mean, name_some
-from unmix_plugin.scenes.placement import METRES_KEY, Placement
+from unmix_plugin.scenes.folder import METRES_KEY
+from unmix_plugin.scenes.placement import Placement
 
 FROM_PICTURES = ESTIMATE, MARKERS, TURNTABLE = "estimate", "markers", "turntable"
 """Words that ask to find poses instead of reading them."""

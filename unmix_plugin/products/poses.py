@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 from unmix_plugin.formats.files import make_folder, write_file
 from unmix_plugin.products.product import Job
 from unmix_plugin.products.scene_products import Poses
-from unmix_plugin.scenes.placement import METRES_KEY
+from unmix_plugin.scenes.folder import METRES_KEY, transforms_bytes
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.trained.camera_files import camera_entry
 from unmix_plugin.trained.run_views import RunView
@@ -26,7 +25,7 @@ def export(job: Job, _: Poses) -> list[Path]:
     content = _poses_json(scene.views, scene.frame, is_refined)
     if job.loaded.scale is not None:
         content[METRES_KEY] = job.loaded.scale.metres_per_unit
-    return [write_file(path, (json.dumps(content, indent=1) + "\n").encode())]
+    return [write_file(path, transforms_bytes(content))]
 
 
 def _poses_json(views: Sequence[RunView], frame: Normalisation, is_refined: bool) -> dict[str, Any]:

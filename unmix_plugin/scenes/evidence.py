@@ -19,7 +19,6 @@ from unmix_plugin.scenes.geometry.lighting import Pictures, local_log_brightness
 from unmix_plugin.scenes.geometry.views import look_up
 from unmix_plugin.scenes.pixel_block import DrawnPixels, PixelBlock
 from unmix_plugin.scenes.pixel_table import PixelTable
-from unmix_plugin.scenes.reading.sensors import lonely_sensors
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.bad_values import BandNoise, judge_bands
 from unmix_plugin.spectral.evidence import (
@@ -182,14 +181,20 @@ def noise_warnings(scene: Scene, noise: dict[int, BandNoise], bad_share: float) 
 def rig_warnings(scene: Scene, reachable: Cells) -> list[str]:
     """Sensors of a rig that share no band with another, or look at other parts of the scene: of cells where something
     may be."""
-    used = {scene.frames[view].sensor for view in scene.train_indices}
-    alone = lonely_sensors(scene.sensors, used)
+    used = sorted({scene.frames[view].sensor for view in scene.train_indices})
+    seen = np.array([scene.sensors[index].seen_bands for index in used])
+    is_shared = seen.sum(axis=0) > 1
+    alone = [
+        scene.sensors[index].name
+        for index, own in zip(used, seen, strict=True)
+        if len(used) > 1 and not (own & is_shared).any()
+    ]
     said = []
     if alone:
         said.append(
             f"no other sensor shares a band with {', '.join(alone)}: only their poses hold their spectra together"
         )
-    for name, share in _overlaps(scene, sorted(used), reachable):
+    for name, share in _overlaps(scene, used, reachable):
         if share < _LEAST_OVERLAP:
             said.append(
                 f"of what sensor {name!r} sees, the other sensors see {share:.0%} (expected at least "

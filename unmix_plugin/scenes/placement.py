@@ -6,20 +6,20 @@ float32, record the first: p_scene = applied_scale * applied_transform @ (p_sour
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float64
 
-from unmix_plugin.scenes.reading.faults import Faults, describe, read_numbers, read_within
+from unmix_plugin.formats.json_values import describe, read_keys, read_numbers
+from unmix_plugin.scenes.folder import WorldKeys
+from unmix_plugin.scenes.reading.faults import Faults
 
-_TRANSFORM_KEY, _SCALE_KEY, _OFFSET_KEY = "applied_transform", "applied_scale", "offset"
-METRES_KEY, METRES_RANGE = "metres_per_unit", (1e-9, 1e9)
-"""Of transforms.json and of a run's record: metres in a unit of the source's world; least and greatest."""
 _ROTATION_TOLERANCE = 1e-5
 """Largest element of R^T R - 1 that passes as rounding of printed digits."""
-_SCALE_RANGE = (1e-12, 1e12)
 _OTHER_OFFSETS = ("aabb", "aabb_scale", "from_na", "render_aabb", "scale")
 """Keys of instant-ngp and NeuS2, whose `offset` leads into a unit cube for rendering and moves no pose."""
 
@@ -64,9 +64,9 @@ class Placement(_Similarity):
     def to_json(self) -> dict[str, Any]:
         """Keys of transforms.json; `read_placement` restores the same value."""
         return {
-            _TRANSFORM_KEY: np.column_stack([self.rotation, self.translation]).tolist(),
-            _SCALE_KEY: self.scale,
-            _OFFSET_KEY: self.offset.tolist(),
+            "applied_transform": np.column_stack([self.rotation, self.translation]).tolist(),
+            "applied_scale": self.scale,
+            "offset": self.offset.tolist(),
         }
 
 
@@ -80,6 +80,11 @@ class Normalisation(_Similarity):
     def to_world(self, points: Float[np.ndarray, "*points 3"]) -> Float64[np.ndarray, "*points 3"]:
         """Model points in world space, the inverse of `to_model`."""
         return self._undo(points)
+
+    def poses_to_model(self, poses: Float64[np.ndarray, "n 3 4"]) -> Float64[np.ndarray, "n 3 4"]:
+        """World poses, camera to world, in model space."""
+        positions = self.to_model(poses[:, :, 3])
+        return np.concatenate([self.rotation @ poses[:, :, :3], positions[:, :, None]], axis=-1)
 
     def after(self, placement: Placement) -> Normalisation:
         """From the source's world to model space, where this one starts from the space of transforms.json."""
@@ -110,40 +115,34 @@ class Normalisation(_Similarity):
         )
 
 
-def read_placement(content: dict[str, Any], faults: Faults, where: str) -> Placement:
-    """What transforms.json records; the identity where it records none, and with noted faults where it is wrong.
+def read_placement(scene: Mapping[str, Any], where: str, faults: Faults) -> tuple[Placement, float | None]:
+    """What transforms.json records of its world: how the poses were moved, the identity where it records nothing; and
+    the metres in a unit of the source's world. Noted faults where one is wrong.
 
     `offset` counts beside one of the other two only, and not in files of instant-ngp, where it means something else.
     """
-    given = content.get(_TRANSFORM_KEY)
+    keys = read_keys(scene, WorldKeys, partial(faults.add, where))
+    given = keys.applied_transform
     rows = given[:3] if isinstance(given, list) and given[3:] == [[0, 0, 0, 1]] else given
     transform = np.eye(3, 4) if given is None else read_numbers(rows, 3, 4)
-    if transform is None or not _is_rotation(transform[:, :3]):
+    is_rotation = False
+    if transform is not None:
+        rotation = transform[:, :3]
+        with np.errstate(over="ignore", invalid="ignore"):
+            is_rotation = bool(np.abs(rotation.T @ rotation - np.eye(3)).max() <= _ROTATION_TOLERANCE)
+        is_rotation = is_rotation and float(np.linalg.det(rotation)) > 0
+    if transform is None or not is_rotation:
         faults.add(
             where,
-            f"'{_TRANSFORM_KEY}' is {describe(given)}; expected 3 rows of 4 numbers, a rotation and a translation; put "
-            "scale into 'applied_scale', or drop the key",
+            f"'applied_transform' is {describe(given)}; expected 3 rows of 4 numbers, a rotation and a translation; "
+            "put scale into 'applied_scale', or drop the key",
         )
         transform = np.eye(3, 4)
-    scale = read_within(content, _SCALE_KEY, *_SCALE_RANGE, "a number above 0", where, faults)
-    is_ours = any(content.get(key) is not None for key in (_TRANSFORM_KEY, _SCALE_KEY))
-    offset = (
-        content.get(_OFFSET_KEY) if is_ours and not any(key in content for key in _OTHER_OFFSETS) else None
-    )
+    is_ours = any(scene.get(key) is not None for key in ("applied_transform", "applied_scale"))
+    offset = keys.offset if is_ours and not any(key in scene for key in _OTHER_OFFSETS) else None
     shift = np.zeros(3) if offset is None else read_numbers(offset, 3)
     if shift is None:
-        faults.add(where, f"'{_OFFSET_KEY}' is {describe(offset)}; expected 3 finite numbers")
+        faults.add(where, f"'offset' is {describe(offset)}; expected 3 finite numbers")
         shift = np.zeros(3)
-    return Placement(transform[:, :3], transform[:, 3], 1.0 if scale is None else scale, shift)
-
-
-def read_metres_per_unit(content: dict[str, Any], faults: Faults, where: str) -> float | None:
-    """Metres in a unit of the source's world, as transforms.json may say; with a noted fault where that is wrong."""
-    expected = "1e-9 to 1e9, such as 0.001 for mm"
-    return read_within(content, METRES_KEY, *METRES_RANGE, expected, where, faults)
-
-
-def _is_rotation(matrix: Float64[np.ndarray, "3 3"]) -> bool:
-    with np.errstate(over="ignore", invalid="ignore"):
-        is_orthonormal = np.abs(matrix.T @ matrix - np.eye(3)).max() <= _ROTATION_TOLERANCE
-    return bool(is_orthonormal) and float(np.linalg.det(matrix)) > 0
+    scale = 1.0 if keys.applied_scale is None else keys.applied_scale
+    return Placement(transform[:, :3], transform[:, 3], scale, shift), keys.metres_per_unit

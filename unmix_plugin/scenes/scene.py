@@ -21,9 +21,10 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.engine.runs.config_json import config_from_json
 from unmix_plugin.scenes.backdrops import BeforeBackdrop
-from unmix_plugin.scenes.placement import METRES_KEY, Normalisation, Placement
+from unmix_plugin.scenes.folder import METRES_KEY
+from unmix_plugin.scenes.placement import Normalisation, Placement
 from unmix_plugin.scenes.reading.cubes import Part, map_array, read_cube, read_invalid
-from unmix_plugin.scenes.reading.foreign_keys import FILE_NAME
+from unmix_plugin.scenes.reading.faults import FILE_NAME
 from unmix_plugin.scenes.reading.images import read_colour, read_labels, read_mask
 from unmix_plugin.settings import SceneOptions
 from unmix_plugin.spectral.sensor import SceneSensor

@@ -11,31 +11,38 @@ axes, vertical field of view in degrees.
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
+import msgspec
 import numpy as np
 import torch
 from jaxtyping import Float64
+from msgspec import Meta
 
-from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.key_poses import KeyPoses
-from unmix_plugin.errors import ConfigError, SceneError
+from unmix_plugin.errors import ConfigError
 from unmix_plugin.formats.files import safe_name
-from unmix_plugin.scenes.placement import read_placement
-from unmix_plugin.scenes.reading.faults import (
-    Faults,
+from unmix_plugin.formats.json_values import (
     UnreadableJsonError,
     describe,
     read_json_file,
+    read_keys,
     read_number,
 )
-from unmix_plugin.scenes.reading.lenses import read_intrinsics
-from unmix_plugin.scenes.reading.transforms_json import read_line_poses, read_pose
+from unmix_plugin.scenes.folder import (
+    Transforms,
+    lens_keys,
+    matrix_entry,
+    parse_transforms,
+    transforms_bytes,
+)
+from unmix_plugin.scenes.frame_cameras import FrameCamera, Intrinsics, make_cameras, read_pose
+from unmix_plugin.scenes.placement import read_placement
+from unmix_plugin.scenes.reading.faults import Faults
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.trained.run_views import RunView
 
@@ -45,7 +52,30 @@ _GREATEST_SIDE_PX = 16_384
 _LEAST_DEG = 1e-4
 """Of a field of view, and from 180 degrees on: beyond, focal lengths leave float32."""
 _GREATEST_FPS, _USUAL_FPS = 1000, 24
-_LENS_KEYS = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4")
+
+_Number = Annotated[float, Meta(ge=-1e300, le=1e300, description="a number")]
+
+
+class _FileKeys(msgspec.Struct, kw_only=True, frozen=True):
+    """Keys of a camera file beside its cameras."""
+
+    space: Annotated[Literal["world", "model"], Meta(description="world or model")] | None = None
+    camera_type: Annotated[Literal["perspective"], Meta(description="perspective")] | None = None
+    render_width: _Number | None = None
+    render_height: _Number | None = None
+
+
+class _PathKeys(msgspec.Struct, kw_only=True, frozen=True):
+    """Keys of a camera in nerfstudio's path."""
+
+    camera_to_world: Any = None
+    fov: (
+        Annotated[
+            float,
+            Meta(ge=_LEAST_DEG, le=180 - _LEAST_DEG, description="degrees between 0 and 180, vertical"),
+        ]
+        | None
+    ) = None
 
 
 @dataclass(frozen=True)
@@ -92,18 +122,30 @@ def read_camera_file(path: Path, frame: Normalisation) -> _CameraFile:
             f"{path} has format_version {describe(version)}; this version reads {_FORMAT_VERSION}: update this package "
             "or write the file again"
         )
-    try:
-        if "camera_path" in content:
-            return _read_camera_path(path, content)
-        if "frames" in content:
-            return _read_frames(path, content, frame)
-    except SceneError as error:
-        raise ConfigError(str(error)) from error
-    keys = ", ".join(sorted(content)) or "none"
-    raise ConfigError(
-        f"{path} is not a camera file: expected 'camera_path', as in nerfstudio's camera_path.json, or 'frames', as in "
-        f"transforms.json; found the keys {keys}"
+    if "camera_path" not in content and "frames" not in content:
+        keys = ", ".join(sorted(content)) or "none"
+        raise ConfigError(
+            f"{path} is not a camera file: expected 'camera_path', as in nerfstudio's camera_path.json, or 'frames', "
+            f"as in transforms.json; found the keys {keys}"
+        )
+    is_path = "camera_path" in content
+    faults = Faults(path)
+    keys = read_keys(content, _FileKeys, partial(faults.add, str(path)))
+    cameras = parse_transforms(content, faults, "camera_path" if is_path else "frames", "camera")
+    faults.raise_if_any(ConfigError)
+    if not cameras.frames:
+        raise ConfigError(
+            f"{path}: '{'camera_path' if is_path else 'frames'}' is empty; expected at least one camera"
+        )
+    views = (
+        _read_path(path, keys, content, cameras.frames)
+        if is_path
+        else _read_frames(path, keys, cameras, frame)
     )
+    if not is_path and "fps" not in content:
+        return _CameraFile(views, None)
+    fps = read_number(content.get("fps", _USUAL_FPS))
+    return _CameraFile(views, check_frames_per_second(fps, f"{path}: 'fps'"))
 
 
 def camera_file_bytes(
@@ -120,7 +162,7 @@ def camera_file_bytes(
         **({} if frames_per_second is None else {"fps": frames_per_second}),
         "frames": [camera_entry(view, frame) for view in views],
     }
-    return (json.dumps(content, indent=1) + "\n").encode()
+    return transforms_bytes(content)
 
 
 def camera_entry(view: RunView, frame: Normalisation) -> dict[str, Any]:
@@ -129,11 +171,10 @@ def camera_entry(view: RunView, frame: Normalisation) -> dict[str, Any]:
 
     def matrix(pose: torch.Tensor) -> list[list[float]]:
         values = pose.double().cpu().numpy()
-        rows = np.column_stack([frame.rotation.T @ values[:, :3], frame.to_world(values[:, 3])])
-        return [*rows.tolist(), [0.0, 0.0, 0.0, 1.0]]
+        return matrix_entry(np.column_stack([frame.rotation.T @ values[:, :3], frame.to_world(values[:, 3])]))
 
-    lens = torch.cat([camera.focal_px, camera.center_px, camera.distortion], dim=1)[0].tolist()
-    entry = {"name": view.name, **dict(zip(_LENS_KEYS, lens, strict=False))}
+    lens = (each[0].tolist() for each in (camera.focal_px, camera.center_px, camera.distortion))
+    entry = {"name": view.name, **lens_keys(*lens)}
     if camera.key_poses is None:
         return {**entry, "transform_matrix": matrix(camera.camera_to_world[0])}
     heights = camera.key_poses.heights.clone()  # those of enlarged images end within their first and last row
@@ -143,122 +184,69 @@ def camera_entry(view: RunView, frame: Normalisation) -> dict[str, Any]:
     return {**entry, "key_poses": [{"row": y - 0.5, "transform_matrix": matrix(pose)} for y, pose in keys]}
 
 
-def _read_camera_path(path: Path, content: dict[str, Any]) -> _CameraFile:
+def _read_path(
+    path: Path, keys: _FileKeys, content: Mapping[str, Any], entries: Sequence[tuple[str, dict[str, Any]]]
+) -> tuple[RunView, ...]:
     """The cameras of a nerfstudio path: pinholes of the file's size."""
-    kind = content.get("camera_type", "perspective")
-    if kind != "perspective":
-        raise ConfigError(f"{path}: camera_type {describe(kind)} is not supported; expected perspective")
     if content.get("crop") is not None:
         raise ConfigError(f"{path}: 'crop' is not supported; take it out to render all of the scene")
-    sides = [_needed_number(content, key, path) for key in ("render_width", "render_height")]
-    width, height = check_size(sides[0], sides[1], f"{path}: render_width and render_height")
+    for key in ("render_width", "render_height"):
+        if getattr(keys, key) is None:
+            raise ConfigError(f"{path}: '{key}' is absent; expected a number")
+    width, height = check_size(
+        keys.render_width or 0, keys.render_height or 0, f"{path}: render_width and render_height"
+    )
     views = []
-    for index, entry in enumerate(_entries(content, "camera_path", path)):
-        values = entry.get("camera_to_world")
+    for index, (where, entry) in enumerate(entries):
+        faults = Faults(path)
+        own = read_keys(entry, _PathKeys, partial(faults.add, where))
+        if entry.get("fov") is None:
+            faults.add(where, "'fov' is absent; expected a number")
+        values = own.camera_to_world
         if isinstance(values, list) and len(values) == 16:
             values = [values[row : row + 4] for row in range(0, 16, 4)]
-        fov_deg = _needed_number(entry, "fov", f"{path}: camera_path[{index}]")
-        if not _LEAST_DEG <= fov_deg <= 180 - _LEAST_DEG:
-            raise ConfigError(
-                f"{path}: camera_path[{index}]: 'fov' is {fov_deg:g}; expected degrees between 0 and 180, vertical"
-            )
-        focal = 0.5 * height / math.tan(math.radians(fov_deg) / 2)
-        faults = Faults(path)
-        pose = read_pose(values, f"camera_path[{index}]", faults, "'camera_to_world'")
-        faults.raise_if_any()
-        assert pose is not None
-        camera = _camera(pose, (focal, focal), (width / 2, height / 2), (0.0,) * 4, (width, height))
+        pose = read_pose(values, where, faults, "'camera_to_world'")
+        faults.raise_if_any(ConfigError)
+        focal = 0.5 * height / math.tan(math.radians(own.fov or 0.0) / 2)
+        lens = Intrinsics("PINHOLE", width, height, (focal, focal))
+        camera = make_cameras([FrameCamera(lens, pose)], [(width, height)], lambda poses: poses)
         views.append(RunView(f"frame_{index:04d}", camera))
-    fps = read_number(content.get("fps", _USUAL_FPS))
-    return _CameraFile(tuple(views), check_frames_per_second(fps, f"{path}: 'fps'"))
+    return tuple(views)
 
 
-def _read_frames(path: Path, content: dict[str, Any], frame: Normalisation) -> _CameraFile:
-    space = content.get("space", "world")
-    if space not in ("world", "model"):
-        raise ConfigError(f"{path}: 'space' is {describe(space)}; expected world or model")
-    entries = _entries(content, "frames", path)
-    names, faults = _names(entries, path), Faults(path)
-    placement = read_placement(content, faults, path.name)
-    faults.raise_if_any()
+def _read_frames(
+    path: Path, keys: _FileKeys, cameras: Transforms, frame: Normalisation
+) -> tuple[RunView, ...]:
+    """The cameras of a transforms.json, of one size."""
+    names, faults = _names([entry for _, entry in cameras.frames], path), Faults(path)
+    placement, _ = read_placement(cameras.scene, path.name, faults)
+    faults.raise_if_any(ConfigError)
 
-    def in_model(poses: Float64[np.ndarray, "n 3 4"]) -> Float64[np.ndarray, "n 3 4"]:
-        if space == "model":
+    def to_model(poses: Float64[np.ndarray, "n 3 4"]) -> Float64[np.ndarray, "n 3 4"]:
+        if keys.space == "model":
             return poses
         positions = frame.to_model(placement.to_source(poses[:, :, 3]))
         rotations = frame.rotation @ placement.rotation.T @ poses[:, :, :3]
         return np.concatenate([rotations, positions[:, :, None]], axis=2)
 
     views = []
-    for index, (entry, name) in enumerate(zip(entries, names, strict=True)):
-        where = f"frames[{index}]"
-        lines = read_line_poses(entry, where, faults)
-        has_rows = lines is not None or faults.noted > 0
-        pose = None if has_rows else read_pose(entry.get("transform_matrix"), where, faults)
-        lens = read_intrinsics(content, entry, where, faults)
-        faults.raise_if_any()
+    for (where, entry), name in zip(cameras.frames, names, strict=True):
+        camera = FrameCamera.read(cameras.scene, entry, where, faults)
+        faults.raise_if_any(ConfigError)
+        lens = camera.lens
         assert lens is not None
         if lens.width is None or lens.height is None:
             raise ConfigError(
                 f"{path}: {where}: 'w' and 'h' are absent; expected the size of the picture in pixels"
             )
-        width, height = check_size(lens.width, lens.height, f"{path}: {where}")
-        middle = [
-            0.5 * side if x is None else x for x, side in zip(lens.center_px, (width, height), strict=True)
-        ]
-        focal_px = lens.focal_at(width, height, lines is not None)
-        assert focal_px is not None
-        keys = None
-        if lines is not None:
-            if (fault := lines.fault(height)) is not None:
-                raise ConfigError(f"{path}: {where}: {fault}")
-            pose = lines.middle(height)
-            poses, heights = (torch.from_numpy(x).float() for x in (in_model(lines.poses), lines.rows + 0.5))
-            keys = KeyPoses(poses, heights, (len(heights),))
-        assert pose is not None
-        camera = _camera(in_model(pose[None])[0], focal_px, middle, lens.coefficients, (width, height), keys)
-        views.append(RunView(name, camera))
+        size = check_size(lens.width, lens.height, f"{path}: {where}")
+        camera = camera.at_size(size[1], where, faults)
+        faults.raise_if_any(ConfigError)
+        views.append(RunView(name, make_cameras([camera], [size], to_model)))
     sizes = {(view.camera.width, view.camera.height) for view in views}
     if len(sizes) > 1:
         raise ConfigError(f"{path}: frames have the sizes {sorted(sizes)}; expected one size for all")
-    if "fps" not in content:
-        return _CameraFile(tuple(views), None)
-    return _CameraFile(tuple(views), check_frames_per_second(read_number(content["fps"]), f"{path}: 'fps'"))
-
-
-def _camera(
-    pose: Float64[np.ndarray, "3 4"],
-    focal_px: Sequence[float],
-    center_px: Sequence[float],
-    distortion: Sequence[float],
-    size: tuple[int, int],
-    keys: KeyPoses | None = None,
-) -> Cameras:
-    matrix, focal, center, bending = (
-        torch.tensor(np.array([x]), dtype=torch.float32) for x in (pose, focal_px, center_px, distortion)
-    )
-    return Cameras(matrix, focal, center, bending, *size, key_poses=keys)
-
-
-def _entries(content: dict[str, Any], key: str, path: Path) -> list[dict[str, Any]]:
-    """The objects in a list, one a camera; a ConfigError for anything else, and for an empty list."""
-    entries = content[key]
-    if not isinstance(entries, list):
-        raise ConfigError(f"{path}: '{key}' is {describe(entries)}; expected a list with one object a camera")
-    if not entries:
-        raise ConfigError(f"{path}: '{key}' is empty; expected at least one camera")
-    for index, entry in enumerate(entries):
-        if not isinstance(entry, dict):
-            raise ConfigError(f"{path}: {key}[{index}] is {describe(entry)}; expected an object")
-    return entries
-
-
-def _needed_number(values: dict[str, Any], key: str, where: Path | str) -> float:
-    number = read_number(values.get(key))
-    if number is None:
-        found = describe(values[key]) if key in values else "absent"
-        raise ConfigError(f"{where}: '{key}' is {found}; expected a number")
-    return number
+    return tuple(views)
 
 
 def _names(entries: Sequence[dict[str, Any]], path: Path) -> list[str]:

@@ -211,7 +211,7 @@ NO_NUMBERS = [{"file_path": f"{i}.png", "transform_matrix": [math.nan] * 12} for
     ("change", "message"),
     [
         ({"frames": []}, "has no camera; expected one for each view"),
-        ({"frames": [1]}, r"frames\[0\] is 1"),
+        ({"frames": [1]}, r"frames\[0\]: is 1"),
         ({"frames": [{"file_path": "a.png"}]}, "'transform_matrix' is absent"),
         ({"frames": [{"transform_matrix": [0] * 11}]}, r"frames\[0\]: .* list of 11; .*4 numbers"),
         ({"frames": NO_NUMBERS}, r"2 of 2 camera matrices .*: 0\.png, 1\.png: .* not finite"),

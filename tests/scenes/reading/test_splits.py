@@ -7,16 +7,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unmix_plugin.errors import SceneError
+from unmix_plugin.scenes.folder import SceneKeys
+from unmix_plugin.scenes.reading.entries import FrameEntry, SceneEntry
 from unmix_plugin.scenes.reading.faults import Faults
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.scenes.reading.splits import Split, split_frames
-from unmix_plugin.scenes.reading.transforms_json import FrameEntry, SceneEntry
 from unmix_plugin.settings import SceneOptions
 
 
 def entry_of(names: list[str], **lists: list[str]) -> SceneEntry:
-    frames = tuple(FrameEntry(name, {"file_path": name}, None, None) for name in names)
-    return SceneEntry(None, None, None, None, {key: tuple(value) for key, value in lists.items()}, frames)
+    frames = tuple(FrameEntry(name, {"file_path": name}) for name in names)
+    return SceneEntry(SceneKeys(), None, None, {key: tuple(value) for key, value in lists.items()}, frames)
 
 
 Method = Literal["auto", "lists", "filename", "interval"]
@@ -54,7 +55,7 @@ def test_lists_go_before_names_of_folders_and_files_and_tests_before_validation(
 
 def test_a_picture_that_several_frames_share_lists_all_of_them():
     shared = [{"file_path": f"images/{i // 2}", "hyperspectral_file_path": f"cubes/{i}"} for i in range(6)]
-    entry = replace(entry_of([]), frames=tuple(FrameEntry("", paths, None, None) for paths in shared))
+    entry = replace(entry_of([]), frames=tuple(FrameEntry("", paths) for paths in shared))
     for lists, expected in (
         ({"test": ("images/1",)}, Split((0, 1, 4, 5), (2, 3))),
         ({"train": ("images/0", "cubes/4"), "test": ("images/1",)}, Split((0, 1, 4), (2, 3))),

@@ -9,8 +9,8 @@ import pytest
 from tests.captures.file_factory import present
 from tests.scenes.scene_factory import fault_of, make_scene
 from unmix_plugin.errors import SceneError
+from unmix_plugin.scenes.frame_cameras import read_lens
 from unmix_plugin.scenes.reading.faults import Faults
-from unmix_plugin.scenes.reading.lenses import read_lens
 from unmix_plugin.scenes.reading.loader import load_scene
 
 

@@ -40,27 +40,23 @@ from unmix_plugin.captures.cube import (
 )
 from unmix_plugin.captures.names import FoundFiles, natural_order, path_text, view_names
 from unmix_plugin.captures.poses.pose_set import load_json
-from unmix_plugin.captures.poses.reading import frames_of, read_poses, read_transforms
+from unmix_plugin.captures.poses.reading import read_poses, read_transforms
 from unmix_plugin.captures.readers.band_files import stack_bands
 from unmix_plugin.captures.readers.exr import channel_names
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.errors import CaptureError, counted
-from unmix_plugin.scenes.reading.faults import Faults, describe, read_numbers
+from unmix_plugin.formats.json_values import describe, read_numbers
+from unmix_plugin.scenes.folder import CUBE_KEY, parse_transforms, read_frame_keys, read_scene_keys
+from unmix_plugin.scenes.reading.entries import read_widths, split_lists
+from unmix_plugin.scenes.reading.faults import Faults
 from unmix_plugin.scenes.reading.splits import split_by_lists
-from unmix_plugin.scenes.reading.transforms_json import (
-    read_sensor_entry,
-    read_split_lists,
-    read_value_scale,
-    read_widths,
-)
 
 Split: TypeAlias = Literal["train", "eval"]
 _SPLIT_OF_FILE: dict[str, Split] = {"train": "train", "val": "eval", "eval": "eval", "test": "eval"}
 """What transforms_<name>.json is for."""
-_CUBE_KEY = "hyperspectral_file_path"
 _TRUTH_KEYS = ("materials", "endmembers_path", "illuminant_path", "abundance_file_path")
 """Of a scene folder, for people and evaluation: processing does not change them."""
-_NAME_KEYS = ("file_path", _CUBE_KEY)
+_NAME_KEYS = ("file_path", CUBE_KEY)
 """Of a frame: the first that is there names it in lists and among poses."""
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
 _NO_WAVELENGTHS = (
@@ -118,10 +114,12 @@ def _read_frames(root: Path, key: str) -> _FrameList:
     frames: dict[str, _Frame] = {}
     repeated: dict[str, int] = defaultdict(int)
     for path, split in files.items():
-        own, listed = frames_of(path, contents[path])
-        top = {**own, **top}
-        for index, values in enumerate(listed):
-            frame = _Frame(f"{path.name}: frames[{index}]", values, split)
+        faults = Faults(path)
+        transforms = parse_transforms(contents[path], faults)
+        faults.raise_if_any(CaptureError)
+        top = {**transforms.scene, **top}
+        for where, values in transforms.frames:
+            frame = _Frame(f"{path.name}: {where}", values, split)
             if frames.setdefault(frame.name or frame.where, frame) is not frame:
                 repeated[path.name] += 1
     for frame in frames.values():
@@ -137,7 +135,7 @@ def _read_frames(root: Path, key: str) -> _FrameList:
 def _split_by_lists(frames: tuple[_Frame, ...], top: dict[str, Any], root: Path) -> tuple[_Frame, ...]:
     """Splits from `train_filenames` and the like, where there are some that are not empty."""
     faults = Faults(root)
-    lists = {name: listed for name, listed in read_split_lists(top, faults).items() if listed}
+    lists = {name: listed for name, listed in split_lists(read_scene_keys(top, faults)).items() if listed}
     names = [[text for key in _NAME_KEYS if (text := frame.text(key))] for frame in frames]
     train, evaluation = split_by_lists(names, lists, faults)
     faults.raise_if_any(CaptureError)
@@ -197,8 +195,8 @@ def find_nerfstudio(root: Path, options: ReadOptions) -> Capture:
 
 def _find_cubes(layout: str, root: Path, options: ReadOptions) -> Capture:
     """The views of a scene whose frames name cubes."""
-    listed = _read_frames(root, _CUBE_KEY)
-    names = view_names([frame.text(_CUBE_KEY) for frame in listed.frames], str(root))
+    listed = _read_frames(root, CUBE_KEY)
+    names = view_names([frame.text(CUBE_KEY) for frame in listed.frames], str(root))
     folders = [PurePosixPath(frame.name).parent.name for frame in listed.frames]
     by_folder: list[Split | None] = [_SPLIT_OF_FILE.get(folder) for folder in folders]
     if None in by_folder or len(set(by_folder)) != 2:
@@ -207,7 +205,7 @@ def _find_cubes(layout: str, root: Path, options: ReadOptions) -> Capture:
     views = []
     found, moved, unlabelled = FoundFiles(root), 0, 0
     for frame, name, split, said in zip(listed.frames, names, by_folder, stated, strict=True):
-        text = frame.text(_CUBE_KEY)
+        text = frame.text(CUBE_KEY)
         cube = found.find(frame.where, text, _in_eval(text))
         if cube is None:
             continue
@@ -268,28 +266,30 @@ def _state_cubes(root: Path, listed: _FrameList, options: ReadOptions) -> tuple[
     values, faults, warnings, centres = listed.top.get("wavelengths"), Faults(root), [], None
     if isinstance(values, list) and values and options.wavelengths_nm is None:
         centres = read_numbers(values, len(values))
-    scale, widths = read_value_scale(listed.top, faults), read_widths(listed.top, faults)
+    keys = read_scene_keys(listed.top, faults)
+    widths = read_widths(keys, faults)
     if widths is not None and (unknown := int(np.isnan(widths).sum())):
         counts = f"{unknown} of {len(widths)} bands"
         warnings, widths = [f"'fwhm' has 0 or null for {counts}: the widths of all count as unknown"], None
     entries = []
     for frame in listed.frames:
-        entry = read_sensor_entry(frame.values, frame.where, faults)
-        for message in _not_followed(frame, entry.bands, None if centres is None else len(centres)):
+        own = read_frame_keys(frame.values, frame.where, faults)
+        own_bands = None if own.bands is None else tuple(own.bands)
+        for message in _not_followed(frame, own_bands, None if centres is None else len(centres)):
             faults.add(frame.where, message)
-        entries.append(entry)
+        entries.append((own.sensor, own_bands))
     faults.raise_if_any(CaptureError)
     # Frames without a name are of one sensor if their bands are the same.
-    unnamed = list(dict.fromkeys(entry.bands for entry in entries if entry.name is None))
+    unnamed = list(dict.fromkeys(own_bands for sensor, own_bands in entries if sensor is None))
     stated = []
-    for entry in entries:
-        number = f"bands {unnamed.index(entry.bands) + 1}" if entry.name is None and len(unnamed) > 1 else ""
-        own = slice(None) if entry.bands is None else list(entry.bands)
+    for sensor, own_bands in entries:
+        number = f"bands {unnamed.index(own_bands) + 1}" if sensor is None and len(unnamed) > 1 else ""
+        own = slice(None) if own_bands is None else list(own_bands)
         bands = None
         if centres is not None:
             own_widths = None if widths is None else widths[own]
             bands = BandTable(centres[own], "'wavelengths' of transforms.json, nm", own_widths)
-        stated.append(_StatedCube(entry.name or number, bands, scale, entry.bands is not None))
+        stated.append(_StatedCube(sensor or number, bands, keys.value_scale, own_bands is not None))
     return stated, warnings
 
 

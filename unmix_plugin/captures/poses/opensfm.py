@@ -15,7 +15,7 @@ from jaxtyping import Float64
 from unmix_plugin.captures.poses import lens
 from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera, PoseSet, SparsePoints, make_pose_set
 from unmix_plugin.errors import CaptureError, name_some
-from unmix_plugin.scenes.reading.faults import describe, read_number, read_numbers
+from unmix_plugin.formats.json_values import describe, read_number, read_numbers
 
 _PLAIN = ("perspective", "simple_radial", "radial", "brown")
 _SIX_TERMS = "k1 k2 k3 k4 k5 k6 p1 p2 s0 s1 s2 s3"

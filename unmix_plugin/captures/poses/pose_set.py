@@ -19,9 +19,9 @@ from jaxtyping import Float64, UInt8
 
 from unmix_plugin.captures.poses.lens import Lens, require_possible
 from unmix_plugin.errors import CaptureError, counted, name_some
+from unmix_plugin.formats.json_values import UnreadableJsonError, read_json_file
 from unmix_plugin.limits import MOST_TABLE_BYTES, parse_xml, read_bounded
 from unmix_plugin.scenes.placement import Placement
-from unmix_plugin.scenes.reading.faults import UnreadableJsonError, read_json_file
 
 FLIP = np.diag([1.0, -1.0, -1.0])
 """From OpenGL to OpenCV camera axes and back, from the right."""

@@ -34,14 +34,15 @@ from unmix_plugin.captures.poses.pose_set import (
 )
 from unmix_plugin.captures.poses.realitycapture import is_realitycapture, read_realitycapture
 from unmix_plugin.errors import CaptureError, counted, name_some
+from unmix_plugin.formats.json_values import describe, read_number, read_numbers
 from unmix_plugin.formats.meshes import read_ply_points
 from unmix_plugin.limits import open_regular
-from unmix_plugin.scenes.placement import Placement, read_metres_per_unit, read_placement
+from unmix_plugin.scenes.folder import Transforms, parse_transforms, unfollowed_keys
+from unmix_plugin.scenes.frame_cameras import Intrinsics, read_lens
+from unmix_plugin.scenes.placement import Placement, read_placement
 from unmix_plugin.scenes.reading.cubes import UnreadableArrayError, map_array, read_array_header
-from unmix_plugin.scenes.reading.faults import Faults, describe, find_named, read_number, read_numbers
-from unmix_plugin.scenes.reading.foreign_keys import FILE_NAME, keys_to_say
+from unmix_plugin.scenes.reading.faults import FILE_NAME, Faults, find_named
 from unmix_plugin.scenes.reading.images import FORMATS
-from unmix_plugin.scenes.reading.lenses import Intrinsics, read_lens
 
 _KNOWN = (
     "transforms.json, a COLMAP model (.bin or .txt), Metashape's cameras as XML, RealityCapture's camera parameters as "
@@ -205,20 +206,6 @@ def _has_frames(content: Any) -> bool:
     return any(isinstance(frame, dict) and "transform_matrix" in frame for frame in frames)
 
 
-def frames_of(path: Path, content: Any) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """What holds for all frames of a transforms.json, or a bare list of frames, and the frames. Raises CaptureError:
-    there is no list of them, or one is no object."""
-    top = content if isinstance(content, dict) else {}
-    frames = top.get("frames") if isinstance(content, dict) else content
-    if not isinstance(frames, list):
-        found = "absent" if frames is None else describe(frames)
-        raise CaptureError(f"{path}: 'frames' is {found}; expected a list with one object a view")
-    for index, frame in enumerate(frames):
-        if not isinstance(frame, dict):
-            raise CaptureError(f"{path}: frames[{index}] is {describe(frame)}; expected an object")
-    return top, frames
-
-
 def read_transforms(contents: Mapping[Path, Any], sizes: Mapping[str, _Size]) -> PoseSet:
     """Poses of what one transforms.json holds, or one for each split. Raises CaptureError: they are none, or can't be
     represented."""
@@ -229,23 +216,25 @@ def read_transforms(contents: Mapping[Path, Any], sizes: Mapping[str, _Size]) ->
     up = np.array([0.0, 0.0, 1.0])
     metres: set[float | None] = set()
     for path, content in contents.items():
-        top, frames = frames_of(path, content)
-        warned, said = keys_to_say(top, frames)
+        faults = Faults(path)
+        transforms = parse_transforms(content, faults)
+        faults.raise_if_any(CaptureError)
         faults = Faults(path.parent if path.name == FILE_NAME else path)
-        placement = read_placement(top, faults, path.name)
-        metres.add(read_metres_per_unit(top, faults, path.name))
-        found = _read_frames(path, top, frames, sizes, faults, warned, said)
+        warned, noted = unfollowed_keys(transforms.scene, [frame for _, frame in transforms.frames])
+        placement, metres_per_unit = read_placement(transforms.scene, path.name, faults)
+        metres.add(metres_per_unit)
+        found = _read_frames(path, transforms, sizes, faults, warned, noted)
         faults.raise_if_any(CaptureError)
         if not placement.is_identity:
-            said.append("applied_transform and applied_scale are undone")
+            noted.append("applied_transform and applied_scale are undone")
         for (name, *others), matrix, lens in found:
             position = placement.to_source(matrix[:, 3])
             matrix = np.column_stack([placement.rotation.T @ matrix[:, :3], position])
             cameras.append((name, PosedCamera(matrix, lens, tuple(others))))
-        points = points or _read_points(path, top, placement, said)
+        points = points or _read_points(path, transforms.scene, placement, noted)
         up = placement.rotation.T @ np.array([0.0, 0.0, 1.0])
         warnings += [f"{path.name}: {text}" for text in dict.fromkeys(warned)]
-        notes += [f"{path.name}: {text}" for text in dict.fromkeys(said)]
+        notes += [f"{path.name}: {text}" for text in dict.fromkeys(noted)]
     where = ", ".join(str(path) for path in contents)
     source = " and ".join(path.name for path in contents)
     made = make_pose_set(cameras, source, where, points, up, notes, warnings)
@@ -254,18 +243,18 @@ def read_transforms(contents: Mapping[Path, Any], sizes: Mapping[str, _Size]) ->
 
 def _read_frames(
     path: Path,
-    top: dict[str, Any],
-    frames: list[dict[str, Any]],
+    transforms: Transforms,
     sizes: Mapping[str, _Size],
     faults: Faults,
     warnings: list[str],
     notes: list[str],
 ) -> list[tuple[list[str], Float64[np.ndarray, "3 4"], Lens | None]]:
     """Names, matrix and lens of each frame, in the file's own world."""
+    top = transforms.scene
     lenses: dict[str, Lens | None] = {}
     read, missing = [], []
-    for index, frame in enumerate(frames):
-        where = f"{path}: frames[{index}]"
+    for index, (place, frame) in enumerate(transforms.frames):
+        where = f"{path}: {place}"
         texts = [frame[key] for key in _NAME_KEYS if isinstance(frame.get(key), str) and frame[key].strip()]
         names = [path_text(text) for text in texts] or [f"#{index:04d}"]
         # Blender's files leave out the suffix.
@@ -281,7 +270,7 @@ def _read_frames(
             common, own = (
                 {key: one[key] for key in one if key != "distortion_params"} for one in (top, frame)
             )
-        given, lens = read_lens(common, own, f"frames[{index}]", faults), None
+        given, lens = read_lens(common, own, place, faults), None
         if given is not None:
             if given.width is not None and given.height is not None:
                 size = (given.width, given.height)

@@ -6,7 +6,6 @@ Notation: `h x w` pixels of a small picture, `B` bands.
 
 from __future__ import annotations
 
-import json
 import textwrap
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
@@ -38,6 +37,7 @@ from unmix_plugin.figures.pictures import Canvas, CanvasLayout, columns_for
 from unmix_plugin.figures.plotting import FIGURE_DPI, figure_bytes, plain_axes
 from unmix_plugin.formats.meshes import write_ply
 from unmix_plugin.scenes.backdrops import Backdrop
+from unmix_plugin.scenes.folder import lens_keys, matrix_entry, transforms_bytes
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 
@@ -192,7 +192,7 @@ def _has_bands_of(sensor: Sensor, other: Sensor) -> bool:
 
 
 def _write_json(path: Path, content: dict[str, Any]) -> None:
-    write_file(path, (json.dumps(content, indent=1, ensure_ascii=False) + "\n").encode())
+    write_file(path, transforms_bytes(content))
 
 
 def _transforms_json(
@@ -209,7 +209,7 @@ def _transforms_json(
     frames = []
     for written, known in zip(seen, facts, strict=True):
         own = {key: value for key, value in known.items() if key not in shared}
-        pose = [*written.camera.camera_to_world.tolist(), [0.0, 0.0, 0.0, 1.0]]
+        pose = matrix_entry(written.camera.camera_to_world)
         frames.append({**written.record.paths, **own, "transform_matrix": pose})
     splits = {}
     if {"train", "eval"} <= {view.split for view in views}:  # others are in neither list
@@ -238,9 +238,7 @@ def _facts(
     lens, centers_nm = written.camera.lens, plan.sensors[view.sensor].centers_nm
     assert lens is not None
     facts: dict[str, Any] = {"w": lens.width, "h": lens.height}
-    keys = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4")
-    numbers = (*lens.focal_px, *lens.center_px, *lens.distortion, *lens.higher_radial)
-    facts |= {key: float(value) for key, value in zip(keys, numbers, strict=True)}
+    facts |= lens_keys(lens.focal_px, lens.center_px, (*lens.distortion, *lens.higher_radial))
     if view.sensor:
         facts["sensor"] = view.sensor
     if view.release:

@@ -40,6 +40,8 @@ from unmix_plugin.neumatex.tracing.rays import RayMesh, pixel_hits
 from unmix_plugin.neumatex.tracing.surface import Surface
 from unmix_plugin.scenes.demo.scene import lens_entries, transform_matrix, user_cache, written_once
 from unmix_plugin.scenes.demo.shading import band_centers_nm
+from unmix_plugin.scenes.folder import transforms_bytes
+from unmix_plugin.scenes.reading.faults import FILE_NAME
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
@@ -301,7 +303,7 @@ def _write_picture(path: Path, colours: Float[Tensor, "H W 3"], alpha: Tensor | 
 
 
 def _write_json(folder: Path, content: dict[str, Any]) -> None:
-    (folder / "transforms.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    (folder / FILE_NAME).write_bytes(transforms_bytes(content))
 
 
 def _save(path: Path, numbers: Tensor) -> None:

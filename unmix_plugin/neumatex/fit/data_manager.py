@@ -35,7 +35,7 @@ from unmix_plugin.neumatex.fit.settings import ObjectRecord
 from unmix_plugin.neumatex.fit.tone import TONE_MAPPINGS
 from unmix_plugin.neumatex.prior.observations import well_spread
 from unmix_plugin.neumatex.tracing.rays import RayMesh
-from unmix_plugin.scenes.placement import METRES_KEY
+from unmix_plugin.scenes.folder import METRES_KEY
 from unmix_plugin.scenes.reading.loader import readable_name
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.colour.conversion import srgb_to_linear

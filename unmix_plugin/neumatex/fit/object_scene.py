@@ -13,12 +13,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 from jaxtyping import Float64
 
 from unmix_plugin.errors import SceneError
+from unmix_plugin.formats.json_values import describe
 from unmix_plugin.neumatex.fit import checks
 from unmix_plugin.neumatex.fit.pictures import PosedPictures, read_picture, read_posed_pictures
 from unmix_plugin.neumatex.fit.tone import TONE_MAPPINGS, ToneMapping
@@ -28,26 +29,16 @@ from unmix_plugin.neumatex.tracing.mesh import MESH_SUFFIXES, Mesh, read_mesh, t
 from unmix_plugin.neumatex.tracing.rays import RayMesh
 from unmix_plugin.scenes.placement import Placement
 from unmix_plugin.scenes.reading.cubes import UnreadableArrayError, map_array
-from unmix_plugin.scenes.reading.faults import (
-    Faults,
-    describe,
-    read_json_file,
-    read_number,
-    resolve_path,
-    sha256_of,
-)
-from unmix_plugin.scenes.reading.foreign_keys import FILE_NAME
+from unmix_plugin.scenes.reading.entries import SceneEntry, read_entries
+from unmix_plugin.scenes.reading.faults import FILE_NAME, Faults, resolve_path, sha256_of
 from unmix_plugin.scenes.reading.loader import read_endmembers
 from unmix_plugin.scenes.reading.splits import Split, split_frames
-from unmix_plugin.scenes.reading.transforms_json import SceneEntry, read_transforms
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable
 
 _EVAL_INTERVAL = 8
 """Every so many frames one is for evaluation, where transforms.json does not say which."""
-_PLACEMENT = {"environment_rotation_deg": 1e6, "environment_exposure_stops": 20.0}
-"""Keys that say how the environment is turned and how bright it is, and the most of each."""
 _NUM_COLOURS = 3
 _SAME_BAND_NM = 0.5
 """Wavelengths in names of files' channels are rounded."""
@@ -205,10 +196,10 @@ class _Folder:
 
     def lamp(self, bands: Bands | None) -> Float64[np.ndarray, " B"] | None:
         """What 'illuminant_path' names, for spectral pictures; None where there is none."""
-        if bands is None or self.entry.illuminant_path is None:
+        if bands is None or self.entry.keys.illuminant_path is None:
             return None
         faults = Faults(self.root)
-        path = resolve_path(self.root, self.entry.illuminant_path, None, "'illuminant_path'", faults)
+        path = resolve_path(self.root, self.entry.keys.illuminant_path, None, "'illuminant_path'", faults)
         faults.raise_if_any()
         return read_lamp(str(path), bands)
 
@@ -216,19 +207,13 @@ class _Folder:
 def _read_folder(root: Path, notes: list[str], needs_mesh: bool) -> _Folder:
     """Read and check the keys of a folder's transforms.json; `notes` gets what is unusual."""
     faults = Faults(root)
-    entry = read_transforms(root, faults, needs_cubes=False)
-    content = read_json_file(root / FILE_NAME)
+    entry = read_entries(root, faults, needs_cubes=False)
+    keys = entry.keys
     split = split_frames(entry, "auto", _EVAL_INTERVAL, faults) if needs_mesh else Split((), ())
-    environment = _find_file(root, content, "environment", ENVIRONMENT_SUFFIXES, faults)
-    mesh = _find_file(root, content, "mesh", MESH_SUFFIXES, faults) if needs_mesh else root
-    placement = []
-    for key, most in _PLACEMENT.items():
-        number = read_number(content.get(key, 0.0))
-        if number is None or abs(number) > most:
-            found = describe(content[key])
-            faults.add(FILE_NAME, f"'{key}' is {found}; expected a number from {-most:g} to {most:g}")
-        placement.append(number or 0.0)
-    tone = content.get("tone_mapping")
+    environment = _find_file(root, keys.environment_path, "environment", ENVIRONMENT_SUFFIXES, faults)
+    mesh = _find_file(root, keys.mesh_path, "mesh", MESH_SUFFIXES, faults) if needs_mesh else root
+    turned = (keys.environment_rotation_deg or 0.0, keys.environment_exposure_stops or 0.0)
+    tone = keys.tone_mapping
     if tone is not None and tone not in TONE_MAPPINGS:
         known = ", ".join(TONE_MAPPINGS)
         faults.add(FILE_NAME, f"'tone_mapping' is {describe(tone)}; expected one of {known}")
@@ -237,19 +222,15 @@ def _read_folder(root: Path, notes: list[str], needs_mesh: bool) -> _Folder:
     assert mesh is not None
     notes += entry.warnings
     tone = cast("ToneMapping | None", tone)
-    return _Folder(root, entry, split, mesh, environment, tuple(placement), tone)
+    return _Folder(root, entry, split, mesh, environment, turned, tone)
 
 
 def _find_file(
-    root: Path, content: dict[str, Any], what: str, suffixes: tuple[str, ...], faults: Faults
+    root: Path, named: str | None, what: str, suffixes: tuple[str, ...], faults: Faults
 ) -> Path | None:
     """The file that a key names, or the only one of its kind; None and a noted fault if there is none."""
     key = f"{what}_path"
-    named = content.get(key)
     if named is not None:
-        if not isinstance(named, str) or not named:
-            faults.add(FILE_NAME, f"'{key}' is {describe(named)}; expected a path")
-            return None
         return resolve_path(root, named, None, f"'{key}'", faults)
     found = sorted(path for path in root.iterdir() if path.suffix.lower() in suffixes and path.is_file())
     usual = [path for path in found if path.stem == what]
@@ -294,10 +275,10 @@ def _read_truth(
     root: Path, entry: SceneEntry, bands: Bands
 ) -> tuple[SpectraTable | None, tuple[Path | None, ...]]:
     """What 'endmembers_path' and each frame's 'abundance_file_path' name; None without endmembers."""
-    if entry.endmembers_path is None:
+    if entry.keys.endmembers_path is None:
         return None, ()
     faults, key, table = Faults(root), "'endmembers_path'", None
-    path = resolve_path(root, entry.endmembers_path, None, key, faults)
+    path = resolve_path(root, entry.keys.endmembers_path, None, key, faults)
     if path is not None:
         table = read_endmembers(path, bands.centers_nm, entry.materials, faults)
     named = [(frame.paths.get("abundance_file_path"), frame.where) for frame in entry.frames]

@@ -18,11 +18,10 @@ from unmix_plugin.errors import CaptureError, SceneError
 from unmix_plugin.neumatex.fit.tone import ToneMapping
 from unmix_plugin.neumatex.tracing.light_files import read_exr, require_light
 from unmix_plugin.scenes.reading.cubes import UnreadableArrayError, map_array, read_array_header
+from unmix_plugin.scenes.reading.entries import FrameEntry, SceneEntry, at_sizes
 from unmix_plugin.scenes.reading.faults import Faults, resolve_path, sha256_of
 from unmix_plugin.scenes.reading.images import UnreadableImageError, read_colour, read_mask
 from unmix_plugin.scenes.reading.loader import distinct_names
-from unmix_plugin.scenes.reading.model_space import make_cameras
-from unmix_plugin.scenes.reading.transforms_json import FrameEntry, SceneEntry, at_sizes
 from unmix_plugin.scenes.scene import Normalisation
 
 LIGHT_SUFFIXES = (".exr", ".npy")
@@ -200,7 +199,7 @@ def read_posed_pictures(
         SceneError: pictures are missing or malformed; all their faults in one message.
     """
     faults = Faults(root)
-    located = [_locate(root, one, entry.value_scale, faults) for one in entry.frames]
+    located = [_locate(root, one, entry.keys.value_scale, faults) for one in entry.frames]
     faults.raise_if_any()
     files = [one for one in located if one is not None]
     sizes, colours = [], set()
@@ -222,7 +221,7 @@ def read_posed_pictures(
     faults.raise_if_any()
     ((count, wavelengths),) = colours
     for one in entry.frames:
-        if one.sensor.bands not in (None, tuple(range(count))):
+        if one.bands not in (None, tuple(range(count))):
             faults.add(
                 one.where,
                 f"'bands' does not list all {count} bands of its picture in order; sort them as 'wavelengths' are, and "
@@ -230,7 +229,7 @@ def read_posed_pictures(
             )
     entry = at_sizes(entry, sizes, faults)
     faults.raise_if_any()
-    cameras, usual = make_cameras(entry, sizes, frame), "linear" if kinds == {True} else "camera"
+    cameras, usual = entry.cameras(sizes, frame), "linear" if kinds == {True} else "camera"
     names = distinct_names([one.colours.relative_to(root).as_posix() for one in files])
     return PosedPictures(names, tuple(files), cameras, tone or usual, count, wavelengths)
 

@@ -23,6 +23,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from unmix_plugin.errors import SceneError
+from unmix_plugin.formats.json_values import read_number
 from unmix_plugin.formats.meshes import least_turns
 from unmix_plugin.limits import (
     MOST_TABLE_BYTES,
@@ -32,8 +33,8 @@ from unmix_plugin.limits import (
     read_bounded,
     refuse,
 )
-from unmix_plugin.scenes.placement import METRES_KEY, METRES_RANGE
-from unmix_plugin.scenes.reading.faults import find_named, read_number
+from unmix_plugin.scenes.folder import METRES_KEY, METRES_RANGE
+from unmix_plugin.scenes.reading.faults import find_named
 
 MAX_TRIANGLES = 5_000_000
 """More are refused: the tree over them and the memory of a training would not fit common machines."""

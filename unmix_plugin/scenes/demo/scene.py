@@ -46,6 +46,8 @@ from unmix_plugin.scenes.demo.shading import (
     smooth_step,
 )
 from unmix_plugin.scenes.demo.shapes import Placement, Points, Rays
+from unmix_plugin.scenes.folder import lens_keys, matrix_entry, transforms_bytes
+from unmix_plugin.scenes.reading.faults import FILE_NAME
 from unmix_plugin.scenes.reading.images import UNLABELLED
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
@@ -64,7 +66,6 @@ _PHONE_ANGLE_DEG = 62.0
 DEFAULT_SIZE, DEFAULT_BANDS, DEFAULT_VIEWS = 96, 31, 32
 SIZE_BOUNDS, _BANDS_BOUNDS, VIEWS_BOUNDS = (16, 1024), (3, 512), (4, 1000)
 _FOLDERS = ("images", "cubes", "labels", "abundances")
-_TRANSFORMS = "transforms.json"
 
 
 def check_bounds(what: str, numbers: Mapping[str, tuple[int, tuple[int, int]]]) -> None:
@@ -159,22 +160,13 @@ def demo_cameras(size: int, views: int, angle_deg: float = _VIEW_ANGLE_DEG) -> C
 
 def lens_entries(cameras: Cameras) -> dict[str, Any]:
     """What transforms.json says of the lens that all of the cameras have."""
-    focal_px, center_px = float(cameras.focal_px[0, 0]), float(cameras.center_px[0, 0])
-    return {
-        "camera_model": "OPENCV",
-        "w": cameras.width,
-        "h": cameras.height,
-        "fl_x": focal_px,
-        "fl_y": focal_px,
-        "cx": center_px,
-        "cy": center_px,
-        **dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0),
-    }
+    lens = (each[0].tolist() for each in (cameras.focal_px, cameras.center_px, cameras.distortion))
+    return {"camera_model": "OPENCV", "w": cameras.width, "h": cameras.height, **lens_keys(*lens)}
 
 
 def transform_matrix(cameras: Cameras, index: int) -> list[list[float]]:
     """Camera to world as the four rows that transforms.json has."""
-    return [*cameras.camera_to_world[index].double().tolist(), [0.0, 0.0, 0.0, 1.0]]
+    return matrix_entry(cameras.camera_to_world[index].double().numpy())
 
 
 def frame_name(index: int) -> str:
@@ -348,15 +340,15 @@ def make_demo_scene(
         "a demo scene",
         {"size": (size, SIZE_BOUNDS), "bands": (bands, _BANDS_BOUNDS), "views": (views, VIEWS_BOUNDS)},
     )
-    with staging_for(directory, "the demo scene", overwrite, _TRANSFORMS) as staging:
+    with staging_for(directory, "the demo scene", overwrite, FILE_NAME) as staging:
         _write_scene(staging / "scene", size, bands, views, illuminant, place)
-        move_files(staging / "scene", directory, _TRANSFORMS)
+        move_files(staging / "scene", directory, FILE_NAME)
 
 
 def is_complete(directory: Path) -> bool:
     """Whether a folder holds a demo scene with all of its files."""
     try:
-        transforms = json.loads((directory / _TRANSFORMS).read_text(encoding="utf-8"))
+        transforms = json.loads((directory / FILE_NAME).read_text(encoding="utf-8"))
         paths = [
             value for frame in transforms["frames"] for key, value in frame.items() if key.endswith("_path")
         ]
@@ -398,7 +390,7 @@ def _write_scene(
         "test_filenames": evaluation,
         "frames": frames,
     }
-    (folder / _TRANSFORMS).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    (folder / FILE_NAME).write_bytes(transforms_bytes(content))
 
 
 def _write_view(

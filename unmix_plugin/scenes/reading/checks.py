@@ -1,23 +1,29 @@
-"""The files of a scene's frames: found, read and checked, one frame's values at a time."""
+"""The files of a scene's frames, read and checked one frame at a time, and which sensor took each frame.
+
+Notation: `B` bands of the scene, `b` channels of a frame's cube.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from unmix_plugin.scenes.reading.cubes import check_abundances, check_cubes, say_clipped
-from unmix_plugin.scenes.reading.faults import Faults, resolve_path
+from unmix_plugin.errors import SpectrumError
+from unmix_plugin.scenes.folder import CUBE_KEY
+from unmix_plugin.scenes.reading.cubes import check_abundances, check_cubes, warn_clipped
+from unmix_plugin.scenes.reading.entries import FrameEntry, Size
+from unmix_plugin.scenes.reading.faults import Faults
 from unmix_plugin.scenes.reading.images import check_colours, check_labels, check_masks
-from unmix_plugin.scenes.reading.sensors import group_by_sensor, read_operators
-from unmix_plugin.scenes.reading.transforms_json import CUBE_KEY, FrameEntry, SceneEntry, Size
 from unmix_plugin.settings import SceneOptions
-from unmix_plugin.spectral.sensor import SceneSensor
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.sensor import SceneSensor, read_sensor
 
 _Pixels = Bool[np.ndarray, "_ _"]
+_Operator = Float64[np.ndarray, "_ _"]
 
 
 @dataclass(frozen=True)
@@ -56,27 +62,7 @@ class CheckedFiles:
         return [frame.size for frame in self.frames]
 
 
-def locate_files(root: Path, entry: SceneEntry, allow_outside: bool, faults: Faults) -> SceneEntry:
-    """The entry whose frames know where their files are; a file that two frames share as their cube is a fault."""
-    frames: list[FrameEntry] = []
-    owner: dict[Path, str] = {}
-    for frame in entry.frames:
-        files: dict[str, Path] = {}
-        for key, text in frame.paths.items():
-            least_parts = 1 if key in ("file_path", CUBE_KEY) else 2
-            path = resolve_path(root, text, allow_outside, frame.where, faults, least_parts)
-            if path is not None:
-                files[key] = path
-        if CUBE_KEY in files:
-            first = owner.setdefault(files[CUBE_KEY].resolve(), frame.where)
-            if first != frame.where:
-                text = frame.paths[CUBE_KEY]
-                faults.add(frame.where, f"is a duplicate: its cube {text!r} is that of {first} too; drop one")
-        frames.append(replace(frame, files=files))
-    return replace(entry, frames=tuple(frames))
-
-
-def check_files(
+def check_frames(
     frames: Sequence[FrameEntry],
     wavelengths_nm: Float64[np.ndarray, " B"] | None,
     num_materials: int | None,
@@ -84,7 +70,7 @@ def check_files(
     faults: Faults,
 ) -> CheckedFiles | None:
     """Read and check all files of all frames; None with noted faults if a cube or a sensor is not sound."""
-    operators = read_operators(frames, wavelengths_nm, faults)
+    operators = _read_operators(frames, wavelengths_nm, faults)
     sizes, values = check_cubes(frames, operators, options, faults)
     shown, masks = check_colours(frames, sizes, faults), check_masks(frames, sizes, faults)
     check_labels(frames, sizes, num_materials, faults)
@@ -94,26 +80,21 @@ def check_files(
     known_operators = [operator for operator in operators if operator is not None]
     if not cubes or len(cubes) < len(frames) or len(known_operators) < len(frames):
         return None
-    unknown = [
-        _union(cube.invalid, None if mask is None else ~mask) for cube, mask in zip(cubes, masks, strict=True)
-    ]
-    for cube, mask, missing in zip(cubes, masks, unknown, strict=True):
+    sensors, indices = _group_by_sensor(frames, known_operators, known_sizes, faults)
+    checked = []
+    for index, (frame, cube, mask, size) in enumerate(zip(frames, cubes, masks, known_sizes, strict=True)):
+        unknown = _union(cube.invalid, None if mask is None else ~mask)
         has_valid = cube.num_invalid_pixels < cube.num_pixels
-        if has_valid and mask is not None and mask.any() and missing is not None and missing.all():
+        if has_valid and mask is not None and mask.any() and unknown is not None and unknown.all():
             message = "the mask leaves only pixels with NaN, infinite or negative values; drop the frame"
             faults.add(cube.where, message)
-    foreground: list[_Pixels | None] = [None] * len(frames)
-    if shown is not None:
-        foreground = [
-            _union(np.ones(size, bool) if seen is None else seen, missing)
-            for size, seen, missing in zip(known_sizes, shown, unknown, strict=True)
-        ]
-    sensors, indices = group_by_sensor(frames, known_operators, known_sizes, faults)
-    paths = [frame.files[CUBE_KEY] for frame in frames]
-    hashes = [cube.sha256 for cube in cubes]
-    columns = zip(paths, hashes, known_sizes, indices, unknown, foreground, strict=True)
-    checked = tuple(CheckedFrame(*row) for row in columns)
-    return CheckedFiles(checked, sensors, say_clipped(cubes, options.value_scale))
+        foreground = None
+        if shown is not None:
+            seen = shown[index]
+            foreground = _union(np.ones(size, bool) if seen is None else seen, unknown)
+        path = frame.files[CUBE_KEY]
+        checked.append(CheckedFrame(path, cube.sha256, size, indices[index], unknown, foreground))
+    return CheckedFiles(tuple(checked), sensors, warn_clipped(cubes, options.value_scale))
 
 
 def _union(one: _Pixels | None, other: _Pixels | None) -> _Pixels | None:
@@ -121,3 +102,74 @@ def _union(one: _Pixels | None, other: _Pixels | None) -> _Pixels | None:
     if one is None or other is None:
         return other if one is None else one
     return one | other
+
+
+def _read_operators(
+    frames: Sequence[FrameEntry], wavelengths_nm: Float64[np.ndarray, " B"] | None, faults: Faults
+) -> list[_Operator | None]:
+    """The operator of each frame, as `SceneSensor.matrix`; None where it can't be told, as without wavelengths."""
+    if wavelengths_nm is None:
+        return [None] * len(frames)
+    tables: dict[Path, _Operator | None] = {}
+    operators: list[_Operator | None] = []
+    for frame in frames:
+        path = frame.files.get("responses_path")
+        if path is not None:
+            if path not in tables:
+                tables[path] = _read_responses(path, Bands(wavelengths_nm), frame.where, faults)
+            operators.append(tables[path])
+            continue
+        rows, last = np.eye(len(wavelengths_nm)), len(wavelengths_nm) - 1
+        chosen = range(last + 1) if frame.bands is None else frame.bands
+        outside = [band for band in chosen if not 0 <= band <= last]
+        if outside:
+            expected = f"expected 0 to {last}, indices into 'wavelengths'"
+            faults.add(frame.where, f"'bands' has {outside[0]}; {expected}")
+        operators.append(None if outside else rows[list(chosen)])
+    return operators
+
+
+def _read_responses(path: Path, bands: Bands, where: str, faults: Faults) -> _Operator | None:
+    """Channels in the order of the table's columns; one that reaches beyond the bands is a fault."""
+    try:
+        sensor = read_sensor(path)
+        seen = sensor.seen_by(bands)
+    except SpectrumError as error:
+        return faults.add(where, str(error))
+    if seen.notes:
+        found = "; ".join(seen.notes)
+        return faults.add(where, f"{path}: {found}; 'wavelengths' must cover all channels")
+    columns = [seen.names.index(name) for name in sensor.column_names]
+    return np.ascontiguousarray(seen.matrix.T[columns])
+
+
+def _group_by_sensor(
+    frames: Sequence[FrameEntry], operators: Sequence[_Operator], sizes: Sequence[Size], faults: Faults
+) -> tuple[tuple[SceneSensor, ...], tuple[int, ...]]:
+    """The sensors in the order in which they appear, and the index of each frame's.
+
+    Frames without a name are of one sensor if their bands and sizes are the same, which is called such as
+    `12-bands-24x24`, with a number behind it where another has that name.
+    """
+    known: dict[str | tuple[bytes, Size], tuple[int, Size]] = {}
+    sensors: list[SceneSensor] = []
+    indices = []
+    for frame, matrix, size in zip(frames, operators, sizes, strict=True):
+        name = frame.sensor
+        key = (matrix.tobytes(), size) if name is None else name
+        if key not in known:
+            known[key] = (len(sensors), size)
+            usual = f"{len(matrix)}-band{'s' * (len(matrix) > 1)}-{size[1]}x{size[0]}"
+            candidates = [usual, *(f"{usual}-{number}" for number in range(2, len(sensors) + 3))]
+            free = [each for each in candidates if each not in {sensor.name for sensor in sensors}]
+            sensors.append(SceneSensor(name or free[0], matrix))
+        index, first_size = known[key]
+        if first_size != size:
+            found, expected = (f"{wide} x {high}" for high, wide in (size, first_size))
+            faults.add(
+                frame.where, f"has {found} pixels, others of sensor {name!r} {expected}; name it otherwise"
+            )
+        elif not np.array_equal(sensors[index].matrix, matrix):
+            faults.add(frame.where, f"has other bands than others of sensor {name!r}; name it otherwise")
+        indices.append(index)
+    return tuple(sensors), tuple(indices)

@@ -20,8 +20,9 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from unmix_plugin.errors import name_some
+from unmix_plugin.scenes.folder import CUBE_KEY
+from unmix_plugin.scenes.reading.entries import FrameEntry, Size
 from unmix_plugin.scenes.reading.faults import Faults, sha256_of
-from unmix_plugin.scenes.reading.transforms_json import CUBE_KEY, FrameEntry, Size
 from unmix_plugin.settings import SceneOptions
 
 READ_HEADER = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
@@ -255,7 +256,7 @@ def check_cubes(
     sound: list[Path | None] = []
     shared: tuple[Size, str] | None = None
     for frame, operator in zip(frames, operators, strict=True):
-        where, path, lens = frame.name_of(CUBE_KEY), frame.files.get(CUBE_KEY), frame.intrinsics
+        where, path, lens = frame.name_of(CUBE_KEY), frame.files.get(CUBE_KEY), frame.camera.lens
         shape = _read_shape(path, "(H, W, B)", where, faults)
         expected = shared
         if lens is not None and lens.width is not None and lens.height is not None:
@@ -268,7 +269,7 @@ def check_cubes(
             faults.add(where, f"the cube has {wide}; expected {width} x {height}, {reason}")
             path = None
         elif shape is not None and operator is not None and shape[2] != len(operator):
-            listed = "'wavelengths' lists" if frame.sensor.bands is None else "its 'bands' list"
+            listed = "'wavelengths' lists" if frame.bands is None else "its 'bands' list"
             listed = "its responses have" if "responses_path" in frame.paths else listed
             faults.add(where, f"the cube has {shape[2]} bands; expected {len(operator)}, as {listed}")
         sizes.append(None if expected is None else expected[0])
@@ -295,7 +296,7 @@ def _check_values(
     return measured
 
 
-def say_clipped(cubes: Sequence[_CubeValues], value_scale: float | None) -> tuple[str, ...]:
+def warn_clipped(cubes: Sequence[_CubeValues], value_scale: float | None) -> tuple[str, ...]:
     """Warnings of a given scale that makes more than highlights brighter than 1."""
     clipped = [cube for cube in cubes if cube.share_above_one > _EXCESS_SHARE]
     if value_scale is None or not clipped:

@@ -1,29 +1,20 @@
-"""What a scene's files say, of unknown origin: JSON values, paths that may be followed, and every fault collected.
-
-A user mends all faults in one go and not one a start.
-"""
+"""Every fault of a scene collected, so that a user mends all in one go and not one per start; and the paths that a
+scene names, of unknown origin, which may be followed."""
 
 from __future__ import annotations
 
 import hashlib
-import json
-import math
 import re
 import time
 import unicodedata
-from collections.abc import Mapping
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 from urllib.parse import unquote
 
-import numpy as np
-
 from unmix_plugin.errors import SceneError, UnmixError, name_some
-from unmix_plugin.limits import MOST_TABLE_BYTES, parse_json, read_bounded
-from unmix_plugin.scenes.reading.foreign_keys import FILE_NAME
 
+FILE_NAME = "transforms.json"
 MAX_LISTED = 20
 """Faults written out in one message; the rest is counted."""
 
@@ -67,75 +58,6 @@ class Faults:
             listed.append(f"  and {len(lines) - MAX_LISTED} more")
         if lines:
             raise kind("\n".join([f"{self._root}: {len(lines)} faults in the scene", *listed]))
-
-
-class UnreadableJsonError(ValueError):
-    """A file holds no JSON; the text says why."""
-
-
-def read_json_file(path: Path) -> Any:
-    """The value in a JSON file. Raises UnreadableJsonError: it is not in UTF-8 or UTF-16, not JSON, nested too deeply,
-    or has text that is not Unicode. Raises OSError: it cannot be opened."""
-    data = read_bounded(path, MOST_TABLE_BYTES)
-    if not data.strip(b"\xef\xbb\xbf\t\r\n "):
-        raise UnreadableJsonError("is empty; expected JSON")
-    try:
-        is_utf16 = data[:2] in (b"\xff\xfe", b"\xfe\xff")
-        content = parse_json(data.decode("utf-16" if is_utf16 else "utf-8-sig"))
-        json.dumps(content, ensure_ascii=False).encode()  # fails on lone surrogates, which no name can hold
-    except json.JSONDecodeError as error:
-        at = f"line {error.lineno}, column {error.colno}"
-        raise UnreadableJsonError(f"is not valid JSON ({error.msg} at {at}); was it cut short?") from error
-    except (UnicodeError, RecursionError) as error:
-        raise UnreadableJsonError(f"is not readable as JSON ({type(error).__name__})") from error
-    except ValueError as error:  # far too many values, numbers of thousands of digits
-        raise UnreadableJsonError(f"is not readable as JSON ({str(error).partition(';')[0]})") from error
-    return content
-
-
-def describe(value: Any) -> str:
-    """A JSON value in a few words, for messages."""
-    if isinstance(value, dict | list):
-        return "an object" if isinstance(value, dict) else f"a list of {len(value)}"
-    text = json.dumps(value, ensure_ascii=False)
-    return text if len(text) <= 40 else text[:37] + "..."
-
-
-def read_number(value: Any) -> float | None:
-    """A finite number, or None; true and false don't count as numbers."""
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return None
-    try:
-        number = float(value)
-    except OverflowError:
-        return None
-    return number if math.isfinite(number) else None
-
-
-def read_numbers(value: Any, *shape: int) -> np.ndarray | None:
-    """A list of so many finite numbers, or of so many such lists, as an array; None if it is anything else."""
-    if not isinstance(value, list) or len(value) != shape[0]:
-        return None
-    parts = [read_numbers(part, *shape[1:]) if shape[1:] else read_number(part) for part in value]
-    return None if any(part is None for part in parts) else np.array(parts, dtype=np.float64)
-
-
-def read_within(
-    content: Mapping[str, Any],
-    key: str,
-    low: float,
-    high: float,
-    expected: str,
-    where: str,
-    faults: Faults,
-    is_whole: bool = False,
-) -> float | None:
-    """The number of a key; None if it is absent, and with a noted fault if it is none from `low` to `high`."""
-    value = content.get(key)
-    number = read_number(value)
-    if value is None or (number is not None and low <= number <= high and not (is_whole and number % 1)):
-        return number
-    return faults.add(where, f"'{key}' is {describe(value)}; expected {expected}")
 
 
 _MOST_FOLDERS = 32

@@ -14,8 +14,8 @@ from jaxtyping import Bool, UInt8
 
 from unmix_plugin.errors import SceneError
 from unmix_plugin.limits import allow_decoded
+from unmix_plugin.scenes.reading.entries import FrameEntry, Size
 from unmix_plugin.scenes.reading.faults import Faults
-from unmix_plugin.scenes.reading.transforms_json import FrameEntry, Size
 
 if TYPE_CHECKING:
     from PIL import Image

@@ -14,13 +14,12 @@ from jaxtyping import Float64
 
 from unmix_plugin.engine.runs.atomic_files import NOT_PORTABLE, safe_name
 from unmix_plugin.errors import SceneError, SpectrumError
-from unmix_plugin.scenes.reading.checks import CheckedFiles, check_files, locate_files
-from unmix_plugin.scenes.reading.faults import Faults, resolve_path, sha256_of
-from unmix_plugin.scenes.reading.foreign_keys import FILE_NAME
-from unmix_plugin.scenes.reading.model_space import find_model_space, make_cameras, without_far_off
-from unmix_plugin.scenes.reading.sensors import unseen_bands
+from unmix_plugin.scenes.folder import CUBE_KEY
+from unmix_plugin.scenes.reading.checks import CheckedFiles, check_frames
+from unmix_plugin.scenes.reading.entries import SceneEntry, at_sizes, locate_files, read_entries
+from unmix_plugin.scenes.reading.faults import FILE_NAME, Faults, resolve_path, sha256_of
+from unmix_plugin.scenes.reading.model_space import find_model_space, without_far_off
 from unmix_plugin.scenes.reading.splits import Split, split_frames
-from unmix_plugin.scenes.reading.transforms_json import CUBE_KEY, SceneEntry, at_sizes, read_transforms
 from unmix_plugin.scenes.scene import Frame, Scene
 from unmix_plugin.settings import SceneOptions
 from unmix_plugin.spectral.bands import Bands
@@ -51,24 +50,25 @@ def load_scene(root: Path, options: SceneOptions | None = None) -> Scene:
         raise SceneError(
             f"{root}: --value-scale: is {scale:g}; expected a positive number, what stands for 1"
         )
-    entry = read_transforms(root, faults)
+    entry = read_entries(root, faults)
     if scale is None:
-        options = replace(options, value_scale=entry.value_scale)
+        options = replace(options, value_scale=entry.keys.value_scale)
     entry = locate_files(root, entry, options.allow_outside_paths, faults)
     truth = _read_truth(root, entry, options, faults)
     num_materials = None if truth.material_names is None else len(truth.material_names)
-    checked = check_files(entry.frames, entry.wavelengths_nm, num_materials, options, faults)
+    checked = check_frames(entry.frames, entry.wavelengths_nm, num_materials, options, faults)
     if checked is not None:
         entry = at_sizes(entry, checked.sizes, faults)
     split = split_frames(entry, options.eval_split, options.eval_interval, faults)
     if checked is not None and split.train and entry.wavelengths_nm is not None:
         train, far_off = without_far_off(entry, split.train)
         used = {checked.frames[index].sensor for index in train}
-        unseen = unseen_bands(checked.sensors, used, entry.wavelengths_nm)
-        if unseen is not None:
-            faults.add("'wavelengths'", unseen)
-        if unseen is not None and far_off is not None:
-            faults.add(FILE_NAME, far_off)
+        is_seen = np.any([checked.sensors[index].seen_bands for index in sorted(used)], axis=0)
+        if not is_seen.all():
+            unseen = ", ".join(f"{nm:g}" for nm in entry.wavelengths_nm[~is_seen])
+            faults.add("'wavelengths'", f"no training frame sees the bands at {unseen} nm; leave them out")
+            if far_off is not None:
+                faults.add(FILE_NAME, far_off)
         split = replace(split, train=train)
         entry = replace(entry, warnings=(*entry.warnings, *checked.warnings, *([far_off] if far_off else [])))
     if options.world == "unbounded" and checked is not None and checked.has_alpha:
@@ -94,17 +94,18 @@ class _Truth:
 
 
 def _read_truth(root: Path, entry: SceneEntry, options: SceneOptions, faults: Faults) -> _Truth:
-    def located(key: str, text: str | None) -> Path | None:
+    def located(key: str) -> Path | None:
+        text = getattr(entry.keys, key)
         if text is None:
             return None
-        return resolve_path(root, text, options.allow_outside_paths, f"'{key}'", faults)
+        return resolve_path(root, text.replace("\\", "/"), options.allow_outside_paths, f"'{key}'", faults)
 
-    light_path = located("illuminant_path", entry.illuminant_path)
-    materials_path = located("endmembers_path", entry.endmembers_path)
+    light_path = located("illuminant_path")
+    materials_path = located("endmembers_path")
     names, illuminant, endmembers, bands = entry.materials, None, None, entry.wavelengths_nm
     if light_path is not None and bands is not None:
         try:
-            illuminant = illuminant_power(light_path, Bands(bands)) / (entry.reflectance_of_1 or 1.0)
+            illuminant = illuminant_power(light_path, Bands(bands)) / (entry.keys.reflectance_of_1 or 1.0)
         except SpectrumError as error:
             faults.add("'illuminant_path'", str(error))
     if materials_path is not None and bands is not None:
@@ -157,7 +158,7 @@ def _assemble(
         fwhm_nm=fwhm_nm,
         sensors=checked.sensors,
         frames=_name_frames(entry, checked),
-        cameras=make_cameras(entry, checked.sizes, space.normalisation),
+        cameras=entry.cameras(checked.sizes, space.normalisation),
         train_indices=split.train,
         eval_indices=split.evaluation,
         scene_box=space.scene_box,

@@ -3,22 +3,20 @@ behind it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Float64
+from jaxtyping import Bool, Float32, Float64
 
 from unmix_plugin.engine.decisions import Decision
 from unmix_plugin.engine.geometry.camera_paths import meeting_point
-from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.key_poses import KeyPoses
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes.backdrops import BeforeBackdrop, find_before_backdrop
 from unmix_plugin.scenes.doctor import check_masks, contradicted_share
+from unmix_plugin.scenes.folder import CUBE_KEY
 from unmix_plugin.scenes.geometry.bounds import find_bounds
 from unmix_plugin.scenes.geometry.carving import MOST_CONTRADICTED
 from unmix_plugin.scenes.geometry.matched_points import find_matched_points
@@ -27,7 +25,7 @@ from unmix_plugin.scenes.geometry.views import Views, commonest
 from unmix_plugin.scenes.placement import Normalisation
 from unmix_plugin.scenes.reading.checks import CheckedFiles
 from unmix_plugin.scenes.reading.cubes import read_cube
-from unmix_plugin.scenes.reading.transforms_json import CUBE_KEY, SceneEntry, Size
+from unmix_plugin.scenes.reading.entries import SceneEntry
 from unmix_plugin.settings import SceneOptions
 
 _FAR_OFF, _MOST_FAR_OFF = 20.0, 0.1
@@ -37,63 +35,16 @@ _LEAST_PLACES = 10
 """Of cameras; among fewer none is called far off."""
 
 
-def make_cameras(entry: SceneEntry, sizes: Sequence[Size], normalisation: Normalisation) -> Cameras:
-    """Cameras of all frames.
-
-    Args:
-        entry: Without faults.
-        sizes: Height and width of each frame's image.
-        normalisation: From the space of transforms.json to that of the cameras.
-    """
-    lenses = [frame.intrinsics for frame in entry.frames if frame.intrinsics is not None]
-    assert len(lenses) == len(entry.frames)
-    centers = [
-        [0.5 * side if at is None else at for at, side in zip(lens.center_px, size[::-1], strict=True)]
-        for lens, size in zip(lenses, sizes, strict=True)
-    ]
-    count = max(len(lens.coefficients) for lens in lenses)  # 6 where any has higher radial terms, or 4
-    distortion = [(*lens.distortion, *lens.higher_radial)[:count] for lens in lenses]
-    focal_px = [
-        lens.focal_at(width, height, frame.line_poses is not None)
-        for lens, (height, width), frame in zip(lenses, sizes, entry.frames, strict=True)
-    ]
-    poses = _world_poses(entry)
-    keys = []
-    for frame, pose in zip(entry.frames, poses, strict=True):  # row r is taken at r + 0.5
-        lines = frame.line_poses
-        rows, own = (np.zeros(1), pose[None]) if lines is None else (lines.rows, lines.poses)
-        heights = torch.from_numpy(rows + 0.5).float()
-        keys.append(KeyPoses(_model_poses(own, normalisation), heights, (len(rows),)))
-    return Cameras.of_sizes(
-        camera_to_world=_model_poses(poses, normalisation),
-        focal_px=torch.tensor(focal_px, dtype=torch.float32),
-        center_px=torch.tensor(centers, dtype=torch.float32),
-        distortion=torch.tensor(distortion, dtype=torch.float32),
-        sizes=[(width, height) for height, width in sizes],
-        key_poses=KeyPoses.join(keys),
-    )
-
-
-def _world_poses(entry: SceneEntry) -> Float64[np.ndarray, "N 3 4"]:
+def _poses_of(entry: SceneEntry) -> Float64[np.ndarray, "N 3 4"]:
     """One pose a frame, as transforms.json has it."""
-    poses = [frame.pose for frame in entry.frames if frame.pose is not None]
-    assert len(poses) == len(entry.frames)
-    return np.stack(poses)
-
-
-def _model_poses(
-    poses: Float64[np.ndarray, "n 3 4"], normalisation: Normalisation
-) -> Float[torch.Tensor, "n 3 4"]:
-    rotations = normalisation.rotation @ poses[:, :, :3]
-    positions = normalisation.to_model(poses[:, :, 3])
-    return torch.from_numpy(np.concatenate([rotations, positions[:, :, None]], axis=-1)).float()
+    return np.stack([frame.camera.pose for frame in entry.frames if frame.camera.pose is not None])
 
 
 def without_far_off(entry: SceneEntry, train: tuple[int, ...]) -> tuple[tuple[int, ...], str | None]:
     """Training views without those whose cameras are so far off that only a wrong pose explains it, and what to say."""
-    if any(frame.pose is None for frame in entry.frames):
+    if any(frame.camera.pose is None for frame in entry.frames):
         return train, None
-    positions = _world_poses(entry)[list(train), :, 3]
+    positions = _poses_of(entry)[list(train), :, 3]
     shots = [entry.frames[view].shot or place.tobytes() for view, place in zip(train, positions, strict=True)]
     places = np.stack(list(dict(zip(shots, positions, strict=True)).values()))  # a rig's lenses share one
     middle = np.median(places, axis=0)
@@ -167,11 +118,11 @@ def find_model_space(
     alpha and poses contradict.
     """
     views = [checked.frames[index] for index in train]
-    poses = _world_poses(entry)[list(train)]
+    poses = _poses_of(entry)[list(train)]
     middle = poses[:, :, 3].mean(axis=0)
     radius = float(np.linalg.norm(poses[:, :, 3] - middle, axis=-1).max())
     first = Normalisation(np.eye(3), -middle, 1.0 / radius if radius > 0.0 else 1.0)
-    cameras = make_cameras(entry, checked.sizes, first)[list(train)]
+    cameras = entry.cameras(checked.sizes, first)[list(train)]
     foreground = [view.foreground for view in views if view.foreground is not None] or None
     alike = commonest([view.sensor for view in views])
 

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from pathlib import PurePosixPath
 from typing import Literal
 
-from unmix_plugin.scenes.reading.faults import Faults
-from unmix_plugin.scenes.reading.foreign_keys import FILE_NAME
-from unmix_plugin.scenes.reading.transforms_json import CUBE_KEY, SceneEntry
+from unmix_plugin.scenes.folder import CUBE_KEY
+from unmix_plugin.scenes.reading.entries import SceneEntry
+from unmix_plugin.scenes.reading.faults import FILE_NAME, Faults
 
 _SPLIT_NAMES = ("train", "eval", "val", "test")
 _SPLIT_NAME = re.compile(

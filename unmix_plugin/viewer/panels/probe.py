@@ -15,7 +15,7 @@ from jaxtyping import Float64
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.formats.files import csv_bytes, write_file
-from unmix_plugin.scenes.placement import METRES_KEY
+from unmix_plugin.scenes.folder import METRES_KEY
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Materials
 from unmix_plugin.trained.measures import Scale
 from unmix_plugin.trained.protocol import Probe, RenderableScene

@@ -1,0 +1,101 @@
+"""JSON of unknown origin: read whole, described in messages, and converted key by key to what a schema asks for.
+
+A schema is a `msgspec.Struct` whose fields are optional and say by `Meta(description=...)` what is expected. Every
+wrong value is noted, not only the first, so that a user mends a file in one go.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeVar, get_args, get_type_hints
+
+import msgspec
+import numpy as np
+
+from unmix_plugin.limits import MOST_TABLE_BYTES, parse_json, read_bounded
+
+
+class UnreadableJsonError(ValueError):
+    """A file holds no JSON; the text says why."""
+
+
+def read_json_file(path: Path) -> Any:
+    """The value in a JSON file. Raises UnreadableJsonError: it is not in UTF-8 or UTF-16, not JSON, nested too deeply,
+    or has text that is not Unicode. Raises OSError: it cannot be opened."""
+    data = read_bounded(path, MOST_TABLE_BYTES)
+    if not data.strip(b"\xef\xbb\xbf\t\r\n "):
+        raise UnreadableJsonError("is empty; expected JSON")
+    try:
+        is_utf16 = data[:2] in (b"\xff\xfe", b"\xfe\xff")
+        content = parse_json(data.decode("utf-16" if is_utf16 else "utf-8-sig"))
+        json.dumps(content, ensure_ascii=False).encode()  # fails on lone surrogates, which no name can hold
+    except json.JSONDecodeError as error:
+        at = f"line {error.lineno}, column {error.colno}"
+        raise UnreadableJsonError(f"is not valid JSON ({error.msg} at {at}); was it cut short?") from error
+    except (UnicodeError, RecursionError) as error:
+        raise UnreadableJsonError(f"is not readable as JSON ({type(error).__name__})") from error
+    except ValueError as error:  # far too many values, numbers of thousands of digits
+        raise UnreadableJsonError(f"is not readable as JSON ({str(error).partition(';')[0]})") from error
+    return content
+
+
+def describe(value: Any) -> str:
+    """A JSON value in a few words, for messages."""
+    if isinstance(value, dict | list):
+        return "an object" if isinstance(value, dict) else f"a list of {len(value)}"
+    text = json.dumps(value, ensure_ascii=False)
+    return text if len(text) <= 40 else text[:37] + "..."
+
+
+def read_number(value: Any) -> float | None:
+    """A finite number, or None; true and false don't count as numbers."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    try:
+        number = float(value)
+    except OverflowError:
+        return None
+    return number if math.isfinite(number) else None
+
+
+def read_numbers(value: Any, *shape: int) -> np.ndarray | None:
+    """A list of so many finite numbers, or of so many such lists, as an array; None if it is anything else."""
+    if not isinstance(value, list) or len(value) != shape[0]:
+        return None
+    parts = [read_numbers(part, *shape[1:]) if shape[1:] else read_number(part) for part in value]
+    return None if any(part is None for part in parts) else np.array(parts, dtype=np.float64)
+
+
+Keys = TypeVar("Keys", bound=msgspec.Struct)
+
+
+def read_keys(values: Mapping[str, Any], schema: type[Keys], note: Callable[[str], Any]) -> Keys:
+    """What an object holds of the keys of a schema; None for those that are absent, null or wrong.
+
+    Args:
+        note: Takes a message for each key whose value is wrong.
+    """
+    found = {}
+    for key, (kind, expected) in _kinds(schema).items():
+        value = values.get(key)
+        if value is None:
+            continue
+        try:
+            found[key] = msgspec.convert(value, kind)
+        except msgspec.ValidationError:
+            note(f"'{key}' is {describe(value)}; expected {expected}")
+    return schema(**found)
+
+
+@cache
+def _kinds(schema: type[msgspec.Struct]) -> dict[str, tuple[Any, str]]:
+    """Type and description of each key."""
+    kinds = {}
+    for key, kind in get_type_hints(schema, include_extras=True).items():
+        notes = [note for part in (kind, *get_args(kind)) for note in getattr(part, "__metadata__", ())]
+        kinds[key] = kind, next((note.description for note in notes), "another value")
+    return kinds
