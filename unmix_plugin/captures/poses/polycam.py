@@ -16,8 +16,8 @@ import numpy as np
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet, load_json, make_pose_set
 from unmix_plugin.errors import CaptureError
+from unmix_plugin.formats.json_values import read_number
 from unmix_plugin.limits import allow_parts
-from unmix_plugin.scenes.reading.faults import read_number
 
 _CORRECTED, _RAW = "corrected_cameras", "cameras"
 _MATRIX = [f"t_{row}{column}" for row in range(3) for column in range(4)]
