@@ -28,8 +28,10 @@ from unmix_plugin.spectral.colour.conversion import illuminant_power, linear_to_
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 
 Array = np.ndarray
-_DEPTH = 7
+_DEPTH = 5
 """Segments of the longest path."""
+_EVALUATION_PATHS = 100
+"""Per pixel and band of views that are kept from training: what is compared with should have no noise of its own."""
 _ABUNDANCE_RAYS = 16
 """Per pixel, for abundances and labels."""
 _UNLABELLED = 255
@@ -70,7 +72,12 @@ class _Tracer:
         }
         matt = {f"body{k}": self._shape(f"body{k}", body, None) for k, body in enumerate(scene.bodies)}
         self._matt = mitsuba.load_dict(
-            {"type": "scene", **matt, "light": {"type": "constant", "radiance": _grey(1.0)}}
+            {
+                "type": "scene",
+                **matt,
+                **self._lamp_in_view(),
+                "light": {"type": "constant", "radiance": _grey(1.0)},
+            }
         )
         self._lit = mitsuba.load_dict({"type": "scene", **lit, **self._lights()})
         self._parameters = {id(each): mitsuba.traverse(each) for each in (self._matt, self._lit)}
@@ -114,8 +121,10 @@ class _Tracer:
             if lamp is not None and lamp.follows_camera and lit is self._lit:
                 self._move_lamp(lamp, index)
             # One seed for all bands of a view: a path carries its whole spectrum.
-            rays, sensor = paths * (3 if is_evaluation else 1), self._sensor(index)
-            image = self._mitsuba.render(lit, sensor=sensor, integrator=integrator, spp=rays, seed=index)
+            rays = max(paths, _EVALUATION_PATHS) if is_evaluation and lit is self._lit else paths
+            image = self._mitsuba.render(
+                lit, sensor=self._sensor(index, rays), integrator=integrator, seed=index
+            )
             images.append(np.array(image, np.float32))
         return np.stack(images)
 
@@ -157,7 +166,15 @@ class _Tracer:
         parameters["lamp.position"] = (pose[:, 3] + pose[:, :3] @ np.asarray(lamp.place)).tolist()
         parameters.update()
 
-    def _sensor(self, index: int) -> Any:
+    def _lamp_in_view(self) -> dict[str, Any]:
+        """The lamp as a body without materials, where views show it."""
+        lamp = self._scene.lamp
+        if lamp is None or lamp.follows_camera or self._scene.has_alpha:
+            return {}
+        black = {"type": "diffuse", "reflectance": _grey(0.0)}
+        return {"lamp": {"type": "sphere", "center": list(lamp.place), "radius": lamp.radius, "bsdf": black}}
+
+    def _sensor(self, index: int, rays: int) -> Any:
         cameras = self._scene.cameras
         pose = cameras.camera_to_world[index].double().numpy()
         origin, up, back = pose[:, 3], pose[:, 1], pose[:, 2]
@@ -172,6 +189,8 @@ class _Tracer:
                 "fov": math.degrees(angle),
                 "to_world": look_at,
                 "film": {**film, "rfilter": {"type": "box"}},
+                # A third of the noise that independent samples have.
+                "sampler": {"type": "multijitter", "sample_count": rays},
             }
         )
 
