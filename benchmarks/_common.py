@@ -34,6 +34,10 @@ RESULTS = Path(__file__).resolve().parent / "results"
 
 MADE = ".made"
 """A file that says that a scene of the cache is whole."""
+UNSEEN = tuple(f"unseen-{number}" for number in range(1, 7))
+"""Drawn scenes: nobody chooses settings by looking at them."""
+SCENES = ("table", "room", "pots", "turntable", "outdoors", *UNSEEN)
+"""Scenes of `scenes.py` that can be trained on as they are."""
 
 Verdict: TypeAlias = Literal["aim reached", "pass", "MISS", "not measured", "reported"]
 
@@ -162,6 +166,45 @@ def scenes_folder() -> Path:
     return Path(given) if given else user_cache() / "benchmark-scenes"
 
 
+def cached_scene(name: str) -> Path:
+    """Folder of a scene of `scenes.py`, which may not be there yet."""
+    return scenes_folder() / name
+
+
+def scene_folders(scenes: Path | None, only: Sequence[str]) -> list[Path]:
+    """Folders of the scenes below a folder, or of those of `scenes.py` if None is given.
+
+    Args:
+        scenes: Folder of scene folders.
+        only: Names of the scenes that are wanted; all if there are none.
+
+    Raises:
+        SystemExit: there is none, or one that is wanted is missing; with status 2.
+    """
+    if scenes is None:
+        names = [name for name in SCENES if name in only] if only else SCENES
+        folders = [cached_scene(name) for name in [*names, *(name for name in only if name not in SCENES)]]
+    elif only:
+        folders = [scenes / name for name in only]
+    else:
+        found = sorted(path.parent for path in scenes.glob("*/transforms.json"))
+        folders = [path for path in found if path.suffix != ".building"]
+        if not folders:
+            require_data(scenes / "*/transforms.json", "any scene")
+    require_scenes(*folders)
+    return folders
+
+
+def require_scenes(*folders: Path) -> None:
+    """End with status 2 where scenes are missing, and say which command makes them."""
+    missing = [folder for folder in folders if not (folder / "transforms.json").is_file()]
+    if not missing:
+        return
+    wanted = " ".join(folder.name for folder in missing if folder == cached_scene(folder.name))
+    remedy = f"make it: python benchmarks/scenes.py --only {wanted}" if wanted else ""
+    require_data(missing[0] / "transforms.json", f"the scene {missing[0].name}", remedy)
+
+
 def is_made(folder: Path) -> bool:
     """Whether `scenes.py` has written all of a scene."""
     return (folder / MADE).is_file()
@@ -177,7 +220,9 @@ def require_data(data: Path, what: str, remedy: str = "") -> None:
     """
     if data.exists():
         return
-    made = f"python benchmarks/scenes.py renders scenes into {scenes_folder()}; name that folder, or one scene in it"
+    made = (
+        f"python benchmarks/scenes.py renders scenes into {scenes_folder()}, where benchmarks look for them"
+    )
     print(f"{what} is missing: {data}. {remedy or made}", file=sys.stderr)
     raise SystemExit(2)
 

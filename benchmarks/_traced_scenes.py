@@ -396,8 +396,8 @@ def unseen(number: int) -> TracedScene:
     light = str(rng.choice(["A", "E"] if sensor == "vnir" else ["A", "D50", "D65"]))
     return TracedScene(
         f"unseen-{number}", "drawn objects on a table" if has_alpha else "drawn objects on a wide floor", wavelengths,
-        _told_apart(names), spectra.clip(0.01, 0.95), light, bodies, lamp, float(rng.uniform(0.2, 0.6)), None, cameras, has_alpha,
-        _every_fourth(views), noise=float(rng.choice([0.0, 0.002, 0.005])),
+        _told_apart(names), spectra.clip(0.01, 0.95), light, bodies, lamp, float(rng.uniform(0.2, 0.6)), None, cameras,
+        has_alpha, _every_fourth(views), noise=float(rng.choice([0.0, 0.002, 0.005])),
     )  # fmt: skip
 
 

@@ -1,6 +1,6 @@
 """How well does training do on captures: light that moves, masks that err, a dark scene with blown-out pixels?
 
-    python benchmarks/captures_training.py [--only basil]
+    python benchmarks/captures_training.py [--basil FOLDER] [--only basil]
 
 Trains the scene `turntable` for 180 s and the real capture "Basil" for 600 s, with the defaults of everything but the
 number of endmembers, and again without each of what captures need: evidence on alpha, light that moves, errors that
@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import tempfile
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -60,8 +60,10 @@ SHOWN = (
 class Options:
     """Train on captures, with and without what they need."""
 
-    shared: Path = _common.REPOSITORY.parent / "shared"
-    """Folder with scenes/turntable and real/basil; what is missing is left out."""
+    turntable: Path = field(default_factory=lambda: _common.cached_scene("turntable"))
+    """The scene turntable of scenes.py; left out where it is missing and Basil is not."""
+    basil: Path | None = None
+    """The files of "Basil" of HS-NeRF, which docs/background/real-captures.md says where to get."""
     only: tuple[str, ...] = ()
     """Names of the scenes to run, turntable and basil; all if none is given."""
     variants: tuple[str, ...] = tuple(VARIANTS)
@@ -82,10 +84,9 @@ def main(options: Options) -> None:
         place = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="unmix-captures-")))
         scenes = _scenes(options, place)
         if not scenes:
-            _common.require_data(
-                options.shared / "scenes/turntable",
-                "every capture that was asked for (--shared)",
-                "docs/background/real-captures.md says where Basil is to be had; put it into real/basil of that folder",
+            _common.require_scenes(options.turntable)
+            raise SystemExit(
+                "of the captures that are asked for, none is given: name Basil's folder (--basil)"
             )
         for name, words in scenes.items():
             _common.publish(
@@ -116,10 +117,10 @@ def report(name: str, words: list[str], options: Options, place: Path) -> _commo
 def _scenes(options: Options, place: Path) -> dict[str, list[str]]:
     """Words that name each scene and its number of endmembers."""
     found = {}
-    turntable, basil = options.shared / "scenes" / "turntable", options.shared / "real" / "basil"
+    turntable, basil = options.turntable, options.basil
     if turntable.is_dir() and "turntable" in (options.only or LIMITS):
         found["turntable"] = ["--data", str(turntable), "--endmembers", "6"]
-    if basil.is_dir() and "basil" in (options.only or LIMITS):
+    if basil is not None and "basil" in (options.only or LIMITS):
         found["basil"] = ["--data", str(_basil.make_scene(basil, place / "basil")), "--endmembers", "3"]
     return found
 

@@ -20,7 +20,7 @@ Takes eight minutes, less with runs that are there already.
 from __future__ import annotations
 
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -39,7 +39,7 @@ RELIGHT = _common.Limit(3.0, is_upper=True)
 class Options:
     """Edit a run with known materials, and relight a run of the built-in scene."""
 
-    scene: Path = _common.REPOSITORY.parent / "shared" / "scenes" / "still-life"
+    scene: Path = field(default_factory=lambda: _common.cached_scene("table"))
     """Scene with true materials, light and labels."""
     run: Path | None = None
     """A run of it; None trains one."""
@@ -58,7 +58,7 @@ class Options:
 def main(options: Options) -> None:
     """Measure and publish."""
     if options.run is None:
-        _common.require_data(options.scene / "transforms.json", "the scene to edit (--scene)")
+        _common.require_scenes(options.scene)
     machine = _machine.describe_machine(options.device)
     seconds = 3.0 if options.quick else options.max_seconds
     with tempfile.TemporaryDirectory(prefix="unmix-editing-") as folder:

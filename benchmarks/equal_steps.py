@@ -1,6 +1,6 @@
 """Does another revision reach as much in as many steps, and as many steps in as much time?
 
-    python benchmarks/equal_steps.py --before CHECKOUT --scenes DIR [--steps 1000]
+    python benchmarks/equal_steps.py --before CHECKOUT [--scenes DIR] [--steps 1000]
 
 Trains every scene below DIR with the package of another checkout and with that of this one, in turn, for equally many
 steps from the same seed, evaluates both with their own command, and compares PSNR, mIoU and the processor time of the
@@ -22,9 +22,6 @@ import _common
 import _machine
 import tyro
 
-ENDMEMBERS = {"still-life": 7, "cbox-sphere": 5, "vnir-pots": 6, "turntable": 6}
-"""Of the shared scenes; 6 for others."""
-
 
 @dataclass(frozen=True)
 class Options:
@@ -32,8 +29,10 @@ class Options:
 
     before: Path
     """Checkout of the other revision."""
-    scenes: Path
-    """Folder of scene folders."""
+    scenes: Path | None = None
+    """Folder of scene folders; None: those of scenes.py."""
+    only: tuple[str, ...] = ()
+    """Names of the scenes; all if none is given."""
     steps: int = 1000
     """Of each training."""
     repeats: int = 1
@@ -45,13 +44,14 @@ class Options:
 def main(options: Options) -> None:
     """Train in pairs, evaluate, publish."""
     machine, measured = _machine.describe_machine("cpu"), {}
-    names = sorted(path.name for path in options.scenes.iterdir() if (path / "transforms.json").is_file())
+    folders = _common.scene_folders(options.scenes, options.only)
+    names = [folder.name for folder in folders]
     checkouts = {"before": options.before.resolve(), "now": _common.REPOSITORY}
-    for name in names:
+    for name, data in zip(names, folders, strict=True):
         runs: dict[str, list[dict[str, float]]] = {"before": [], "now": []}
         for _ in range(options.repeats):
             for which, checkout in checkouts.items():
-                runs[which].append(_trained(checkout, options.scenes / name, options.steps))
+                runs[which].append(_trained(checkout, data, options.steps))
         measured[name] = {which: _median(found) for which, found in runs.items()}
     figures = [figure for name, found in measured.items() for figure in _figures(name, found)]
     setting = {"steps": options.steps, "repeats": options.repeats, "scenes": names}
@@ -66,7 +66,8 @@ def _trained(checkout: Path, scene: Path, steps: int) -> dict[str, float]:
     with tempfile.TemporaryDirectory(prefix="unmix-steps-") as folder:
         place = Path(folder)
         words = ["unmix-nerf", "--data", str(scene.resolve()), "--max-num-iterations", str(steps)]
-        words += ["--pipeline.model.num-endmembers", str(ENDMEMBERS.get(scene.name, 6)), "--device", "cpu"]
+        materials = json.loads((scene / "transforms.json").read_text(encoding="utf-8"))["materials"]
+        words += ["--pipeline.model.num-endmembers", str(len(materials)), "--device", "cpu"]
         ended = _common.run_command(_command("train", words), place, env)
         [run] = place.glob("outputs/*/*/*")
         _common.run_command(_command("evaluate", ["--run", str(run), "--device", "cpu"]), place, env)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import tempfile
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -32,7 +32,7 @@ FORMATS = {
 class Options:
     """Render all evaluation views of a scene with all outputs."""
 
-    scene: Path = _common.REPOSITORY.parent / "shared" / "scenes" / "still-life"
+    scene: Path = field(default_factory=lambda: _common.cached_scene("table"))
     """Scene folder to train on."""
     run: Path | None = None
     """Run folder to render from, in place of training."""
@@ -66,7 +66,7 @@ def train(options: Options, folder: Path) -> Path:
         scene, seconds = folder / "scene", 2.0
         script = _common.console_script("unmix-demo-scene")
         _common.run_command([script, str(scene), "--size", "32", "--bands", "8", "--views", "8"])
-    _common.require_data(scene / "transforms.json", "the scene (--scene), or a run (--run)")
+    _common.require_scenes(scene)
     words = ["--data", str(scene), "--output-dir", str(folder / "outputs"), "--device", options.device]
     script = _common.console_script("unmix-train")
     return _common.run_command([script, "unmix-nerf", *words, "--max-seconds", f"{seconds:g}"]).run

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import shutil
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ SHOWN = ("psnr", "psnr_matter", "ssim", "sam", "miou", "abundance_rmse", "endmem
 class Options:
     """Train on few of a scene's views."""
 
-    scene: Path = _common.REPOSITORY.parent / "shared" / "scenes" / "still-life"
+    scene: Path = field(default_factory=lambda: _common.cached_scene("table"))
     """Scene folder with `train_filenames` and `materials`."""
     views: tuple[int, ...] = (5, 10, 1000)
     """Numbers of training views; more than there are means all."""
@@ -40,7 +40,7 @@ class Options:
 
 def main(options: Options) -> None:
     """Train on each number of views and publish."""
-    _common.require_data(options.scene / "transforms.json", "the scene (--scene)")
+    _common.require_scenes(options.scene)
     machine, measured = _machine.describe_machine("cpu"), {}
     steps = 10 if options.quick else options.steps
     content = json.loads((options.scene / "transforms.json").read_text(encoding="utf-8"))

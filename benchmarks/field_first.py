@@ -16,7 +16,7 @@ import json
 import statistics
 import tempfile
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -63,9 +63,9 @@ _SHOWN = ("miou", "abundance_rmse", "endmember_angle", "psnr")
 class Options:
     """Train both, unmix one of them afterwards."""
 
-    scenes: Path = _common.REPOSITORY.parent / "shared" / "scenes"
+    scenes: Path = field(default_factory=_common.scenes_folder)
     """Folder of scene folders with labels, abundances and true spectra."""
-    only: tuple[str, ...] = ("still-life", "cbox-sphere", "vnir-pots", "turntable")
+    only: tuple[str, ...] = ("table", "room", "pots", "turntable")
     """Names of the scenes."""
     steps: int = 600
     """Of each training."""
@@ -81,8 +81,8 @@ class Options:
 
 def main(options: Options) -> None:
     """Train what is missing, score, publish."""
-    for name in () if options.only_existing else options.only:
-        _common.require_data(options.scenes / name / "transforms.json", f"the scene {name} (--scenes)")
+    if not options.only_existing:
+        _common.require_scenes(*(options.scenes / name for name in options.only))
     measured: dict[str, dict[str, list[dict[str, float]]]] = {}
     with ExitStack() as stack:
         runs = options.runs or Path(

@@ -3,8 +3,9 @@
     python benchmarks/gpu.py
 
 One command of at most nine minutes. Where PyTorch finds a GPU it runs every test that uses one, times each operator
-beside its PyTorch twin, trains still-life for 20 s and the built-in scene at 512 x 512 pixels for 30 s, evaluates both,
-and measures a frame of 512 x 512 pixels as the viewer shows it. Elsewhere it says why not and writes nothing.
+beside its PyTorch twin, trains the scene table for 20 s and the built-in scene at 512 x 512 pixels for 30 s,
+evaluates both, and measures a frame of 512 x 512 pixels as the viewer shows it. Elsewhere it says why not and writes
+nothing.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import sys
 import time
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from statistics import median
@@ -31,7 +32,7 @@ IN_PARALLEL = ("-n", "8", "-p", "no:benchmark")  # a plugin that refuses to be b
 SIDE = 512
 FRAME_RATE = _common.Limit(30, unit=" frames/s")
 SAMPLES_PER_SECOND = _common.Limit(10e6, unit=" samples/s")
-STILL_LIFE = _common.Limit(37, unit=" dB")
+TABLE = _common.Limit(35, unit=" dB")
 LARGE_SCENE = _common.Limit(33, unit=" dB")
 
 
@@ -39,15 +40,15 @@ LARGE_SCENE = _common.Limit(33, unit=" dB")
 class Options:
     """Tests, operators, trainings and viewer frames on a CUDA GPU."""
 
-    scenes: Path = _common.REPOSITORY.parent / "shared" / "scenes"
-    """Folder that holds still-life; without it that scene is left out."""
+    scenes: Path = field(default_factory=_common.scenes_folder)
+    """Folder that holds the scene table."""
     results: Path | None = None
     """Folder for gpu.json and the table; None: beside the benchmarks."""
     rehearse: bool = False
     """Do it all on the CPU, small, to see that it would work; figures mean nothing and nothing is written."""
 
     leave_out: tuple[str, ...] = ()
-    """Parts to leave out where time is short: operators, still-life, "large scene", viewer."""
+    """Parts to leave out where time is short: operators, table, "large scene", viewer."""
 
     @property
     def device(self) -> Literal["cpu", "cuda"]:
@@ -65,8 +66,8 @@ def main(options: Options) -> None:
     except ConfigError as error:
         print(f"nothing measured: {error}", file=sys.stderr)
         raise SystemExit(2) from error
-    if "still-life" not in options.leave_out:
-        _common.require_data(options.scenes / "still-life", "the scene still-life (--scenes, --leave-out)")
+    if "table" not in options.leave_out:
+        _common.require_scenes(options.scenes / "table")
     figures, measured = [run_tests()], {}
     with TemporaryDirectory(prefix="unmix-gpu-") as folder:
         for name, part in parts(Path(folder), options).items():
@@ -104,10 +105,10 @@ def run_tests() -> _common.Figure:
 
 def parts(work: Path, options: Options) -> dict[str, Callable[[], tuple[_common.Figure, Any]]]:
     """What is measured after the tests, by name; the last one looks at what the one before trained."""
-    still_life, large = options.scenes / "still-life", work / "large"
+    table, large = options.scenes / "table", work / "large"
     return {
         "operators": partial(time_operators, work, options),
-        "still-life": partial(train, still_life, work, 20, 7, STILL_LIFE, options),
+        "table": partial(train, table, work, 20, 7, TABLE, options),
         "large scene": partial(train, large, work, 30, 6, LARGE_SCENE, options),
         "viewer": partial(frame_rate, work, options.device),
     }

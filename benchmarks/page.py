@@ -31,7 +31,6 @@ from PIL import Image
 SIZE = _common.Limit(20.0, is_upper=True, unit=" MB")
 FIRST = _common.Limit(3.0, is_upper=True, unit=" s")
 DIFFERENCE = _common.Limit(3.0, is_upper=True)
-SCENES = _common.REPOSITORY.parent / "shared" / "scenes"
 SIDE = 160
 """Of the pictures that are compared."""
 SIZES = {"1440 x 900": (1440, 900), "390 x 844": (390, 844)}
@@ -100,16 +99,15 @@ def main(options: Options) -> None:
 
 def trained(options: Options, folder: Path) -> list[Path]:
     """A run of each scene."""
-    scenes = [("unmix-nerf", SCENES / name) for name in ("still-life", "vnir-pots")]
+    scenes = [("unmix-nerf", _common.cached_scene(name)) for name in ("table", "pots")]
     jobs = [*scenes, ("neumatex", Path("demo-object"))]
     seconds = options.max_seconds
     if options.quick:
         script = _common.console_script("unmix-demo-scene")
         _common.run_command([script, str(folder / "scene"), "--size", "32", "--bands", "8", "--views", "8"])
         jobs, seconds = [("unmix-nerf", folder / "scene")], 2.0
-    for _, scene in jobs if not options.quick else ():
-        if scene.name != "demo-object":
-            _common.require_data(scene / "transforms.json", f"the scene {scene.name}")
+    else:
+        _common.require_scenes(*(scene for _, scene in scenes))
     script = _common.console_script("unmix-train")
     rest = ["--output-dir", str(folder / "outputs"), "--max-seconds", f"{seconds:g}"]
     return [_common.run_command([script, method, "--data", str(data), *rest]).run for method, data in jobs]

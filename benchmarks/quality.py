@@ -1,11 +1,12 @@
 """How well are unseen views predicted, and materials found, after three minutes of training?
 
-    python benchmarks/quality.py [--scenes DIR] [--max-seconds 180]
+    python benchmarks/quality.py [--scenes DIR] [--max-seconds 180 | --steps 4000]
 
 Trains and evaluates each scene below DIR by the commands that a user would give, with the defaults of everything but
 the number of endmembers. Beside the segmentation are two methods that see single images only, scored by the same
 code on the true pixels of the evaluation views: k-means on spectra of equal length, and VCA with the nearest endmember
-by angle, their spectra found in the training views. Takes four minutes a scene.
+by angle, their spectra found in the training views. Takes four minutes a scene. Where other programs share the machine,
+give steps: a step is the same everywhere, a second is not.
 """
 
 from __future__ import annotations
@@ -47,9 +48,9 @@ LIMITS = {
         _common.Limit(miou),
     )
     for name, psnr, psnr_aim, sam, sam_aim, miou in (
-        ("still-life", 34.5, 37.0, 0.035, 0.02, 0.6),
-        ("cbox-sphere", 30.5, 34.0, 0.07, 0.04, 0.5),
-        ("vnir-pots", 32.0, 35.0, 0.045, 0.025, 0.55),
+        ("table", 33.0, 36.0, 0.035, 0.02, 0.6),
+        ("room", 28.0, 32.0, 0.07, 0.04, 0.5),
+        ("pots", 31.0, 34.0, 0.045, 0.025, 0.55),
     )
 }
 """By name of the scene's folder; of other scenes the figures are reported only."""
@@ -59,13 +60,15 @@ LIMITS = {
 class Options:
     """Train and evaluate on each scene, beside two methods that see single images only."""
 
-    scenes: Path = _common.REPOSITORY.parent / "shared" / "scenes"
-    """Folder of scene folders."""
+    scenes: Path | None = None
+    """Folder of scene folders; None: those of scenes.py."""
     only: tuple[str, ...] = ()
     """Names of the scenes to run; all if none is given. The others keep their earlier results, if they have the same
     setting."""
     max_seconds: float = 180.0
     """Seconds of training a scene."""
+    steps: int | None = None
+    """Steps of training a scene, in place of seconds."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where to train."""
     runs: Path | None = None
@@ -78,16 +81,14 @@ class Options:
 
 def main(options: Options) -> None:
     """Measure every scene and publish."""
-    folders = sorted(path.parent for path in options.scenes.glob("*/transforms.json"))
-    folders = [path for path in folders if not options.only or path.name in options.only]
-    if not folders:
-        _common.require_data(
-            options.scenes / "*/transforms.json", "every scene that was asked for (--scenes, --only)"
-        )
+    folders = _common.scene_folders(options.scenes, options.only)
     machine = _machine.describe_machine(options.device)
     seconds = 3.0 if options.quick else options.max_seconds
+    limit: dict[str, float] = {"max_seconds": seconds}
+    if options.steps is not None and not options.quick:
+        limit = {"steps": options.steps}
     setting = {
-        "max_seconds": seconds,
+        **limit,
         "device": options.device,
         "options": "defaults, but --pipeline.model.num-endmembers = number of materials",
         "baseline_seeds": list(BASELINE_SEEDS),
@@ -97,10 +98,10 @@ def main(options: Options) -> None:
     with ExitStack() as stack:
         runs = options.runs or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="unmix-quality-")))
         for folder in folders:
-            measured[folder.name] = measure(folder, seconds, options.device, runs)
+            measured[folder.name] = measure(folder, limit, options.device, runs)
     measured = dict(sorted(measured.items()))
     figures = [figure for name, values in measured.items() for figure in judge(name, values)]
-    question = f"Evaluation views after {seconds:g} s of training"
+    question = f"Evaluation views after {_in_words(limit)} of training"
     report = _common.Report("quality", question, setting, machine, figures, measured, (details(measured),))
     _common.publish(report, results)
 
@@ -114,12 +115,14 @@ def earlier(results: Path | None, setting: dict[str, Any]) -> dict[str, dict[str
     return report["measured"] if report["setting"] == setting else {}
 
 
-def measure(folder: Path, max_seconds: float, device: str, runs: Path) -> dict[str, Any]:
+def measure(folder: Path, limit: dict[str, float], device: str, runs: Path) -> dict[str, Any]:
     """Train, evaluate and score the baselines on one scene."""
     num_endmembers = len(json.loads((folder / "transforms.json").read_text(encoding="utf-8"))["materials"])
     load_average = _machine.load_average()
-    print(f"{folder.name}: training {max_seconds:g} s with {num_endmembers} endmembers ...", flush=True)
-    words = ["unmix-nerf", "--data", str(folder), "--max-seconds", str(max_seconds), "--device", device]
+    print(f"{folder.name}: training {_in_words(limit)} with {num_endmembers} endmembers ...", flush=True)
+    words = ["unmix-nerf", "--data", str(folder), "--device", device]
+    for option, value in limit.items():
+        words += ["--max-num-iterations" if option == "steps" else "--max-seconds", f"{value:g}"]
     words += ["--output-dir", str(runs), "--pipeline.model.num-endmembers", str(num_endmembers)]
     trained = _common.run_command([_common.console_script("unmix-train"), *words])
     print(f"{folder.name}: evaluating ...", flush=True)
@@ -130,6 +133,7 @@ def measure(folder: Path, max_seconds: float, device: str, runs: Path) -> dict[s
     return {
         "num_endmembers": num_endmembers,
         "load_average_at_start": load_average,
+        "revision": _machine.revision(),
         "metrics": {
             **{key: value for key, value in metrics.items() if key not in ("definitions", "per_view")},
             **samples_at_the_end(trained.run),
@@ -137,6 +141,7 @@ def measure(folder: Path, max_seconds: float, device: str, runs: Path) -> dict[s
         "per_view": metrics["per_view"],
         "training_peak_gib": trained.peak_bytes / 2**30,
         "training_command_seconds": trained.seconds,
+        "training_cpu_seconds": trained.cpu_seconds,
         "evaluation_command_seconds": evaluated.seconds,
         "baseline_miou": baselines(folder, num_endmembers),
     }
@@ -216,9 +221,13 @@ def details(measured: dict[str, dict[str, Any]]) -> _common.DetailTable:
     rows = [[name, *(_number(values["metrics"].get(name)) for values in measured.values())] for name in names]
     rows += [
         [key.replace("_", " "), *(_number(values[key]) for values in measured.values())]
-        for key in ("load_average_at_start", "training_command_seconds")
+        for key in ("load_average_at_start", "training_command_seconds", "training_cpu_seconds")
     ]
     return _common.DetailTable("All metrics", ["metric", *measured], rows)
+
+
+def _in_words(limit: dict[str, float]) -> str:
+    return " and ".join(f"{value:g} {'steps' if key == 'steps' else 's'}" for key, value in limit.items())
 
 
 def _span(values: list[float]) -> str:

@@ -33,8 +33,8 @@ from _unmixing_report import OURS, SceneFigures, Seeds, judge, tables
 class Options:
     """Unmix each scene by each method."""
 
-    scenes: Path = _common.REPOSITORY.parent / "shared" / "scenes"
-    """Folder of scene folders; each needs labels and true spectra."""
+    scenes: Path | None = None
+    """Folder of scene folders; each needs labels and true spectra. None: those of scenes.py."""
     only: tuple[str, ...] = ()
     """Names of the scenes; all if none is given."""
     rows: tuple[str, ...] = ("2d", OURS, "3d:published")
@@ -59,7 +59,7 @@ def main(options: Options) -> None:
     names = chosen_rows(("2d:k-means, NNLS", "2d:oracle, NNLS", OURS) if options.quick else options.rows)
     seeds = options.seeds[:1] if options.quick else options.seeds
     seconds = 3.0 if options.quick else options.max_seconds
-    folders = scene_folders(options.scenes, options.only)
+    folders = _common.scene_folders(options.scenes, options.only)
     machine = _machine.describe_machine(options.device)
     setting = {
         "options": "defaults, but the seed, --pipeline.model.num-endmembers and the words of each 3-D row",
@@ -132,21 +132,6 @@ def chosen_rows(asked: tuple[str, ...]) -> list[str]:
     if unknown:
         raise SystemExit(f"no row is called {unknown[0]!r}; take 2d, 3d or any of: {'; '.join(known)}")
     return [name for name in known if name in asked or name[:2] in asked]
-
-
-def scene_folders(scenes: Path, only: tuple[str, ...]) -> list[Path]:
-    """Folders of the scenes to measure.
-
-    Raises:
-        SystemExit: there is none; with status 2.
-    """
-    folders = [path.parent for path in sorted(scenes.glob("*/transforms.json"))]
-    folders = [path for path in folders if not only or path.name in only]
-    if not folders:
-        _common.require_data(
-            scenes / "*/transforms.json", "every scene that was asked for (--scenes, --only)"
-        )
-    return folders
 
 
 def measure_pixels(folder: Path, names: list[str], seeds: tuple[int, ...], found: SceneFigures) -> None:

@@ -1,6 +1,7 @@
 """Results that pages cite: each names the clean revision that it was measured at, and what it depends on is known."""
 
 import importlib.util
+import os
 import subprocess
 import sys
 
@@ -23,13 +24,11 @@ DEPENDS = module_of(ROOT / "benchmarks/_depends.py")
 CHECK = module_of(ROOT / "scripts/check_results.py")
 TO_MEASURE_AGAIN = {
     "confidence": "python benchmarks/confidence.py",
-    "export_speed": "python benchmarks/export_speed.py",
     "found_poses": "python benchmarks/found_poses.py --folder DIR",
     "gpu": "python benchmarks/gpu.py",
     "neumatex_prior": "python benchmarks/neumatex_prior.py",
     "quality": "python benchmarks/quality.py",
     "unmixing_2d-samson": "python benchmarks/unmixing_2d.py samson_dataset.mat --endmembers 3 --seeds 5 --json",
-    "viewer": "python benchmarks/viewer.py",
 }
 """Results that are not clean, each with the command that measures it again. No other may join them."""
 
@@ -56,15 +55,42 @@ def test_every_result_is_of_a_benchmark_that_is_here():
     assert {DEPENDS.benchmark_of(stem) for stem in stems} <= set(DEPENDS.DEPENDS_ON)
 
 
-@pytest.mark.parametrize("name", ["quality", "unmixing", "editing", "few_views", "captures_training"])
-def test_a_benchmark_without_its_data_ends_with_2_and_says_what_makes_them(name, tmp_path):
-    option = {"editing": "--scene", "few_views": "--scene", "captures_training": "--shared"}.get(
-        name, "--scenes"
-    )
-    words = [sys.executable, ROOT / f"benchmarks/{name}.py", option, tmp_path / "nothing"]
+WITHOUT_SCENES = {
+    "captures_training": "turntable",
+    "editing": "table",
+    "equal_steps": "table",
+    "export_speed": "table",
+    "few_views": "table",
+    "field_first": "table",
+    "quality": "table",
+    "unmixing": "table",
+}
+"""The first scene that each benchmark misses where there is none."""
+
+
+@pytest.mark.parametrize("name", WITHOUT_SCENES)
+def test_a_benchmark_without_its_scenes_ends_with_2_and_says_what_makes_them(name, tmp_path):
+    words = [
+        sys.executable,
+        ROOT / f"benchmarks/{name}.py",
+        *(["--before", ROOT] if name == "equal_steps" else []),
+    ]
+    env = {**os.environ, "UNMIX_BENCHMARK_SCENES": str(tmp_path)}
+    ended = subprocess.run(words, capture_output=True, text=True, check=False, env=env)
+    assert ended.returncode == 2, ended.stderr
+    assert f"the scene {WITHOUT_SCENES[name]} is missing" in ended.stderr
+    assert f"python benchmarks/scenes.py --only {WITHOUT_SCENES[name]}" in ended.stderr
+
+
+def test_a_folder_without_scenes_is_no_result(tmp_path):
+    words = [sys.executable, ROOT / "benchmarks/quality.py", "--scenes", tmp_path]
     ended = subprocess.run(words, capture_output=True, text=True, check=False)
     assert ended.returncode == 2, ended.stderr
-    assert "is missing" in ended.stderr
-    assert (
-        "real-captures.md" if name == "captures_training" else "python benchmarks/scenes.py"
-    ) in ended.stderr
+    assert "any scene is missing" in ended.stderr
+
+
+def test_no_benchmark_looks_beside_the_repository():
+    sources = {path.name: path.read_text(encoding="utf-8") for path in (ROOT / "benchmarks").glob("*.py")}
+    assert [
+        name for name, text in sources.items() if "REPOSITORY.parent" in text.replace("parent.parent", "")
+    ] == []
