@@ -208,15 +208,86 @@ def test_a_mask_of_any_kind_is_the_disc_that_it_shows(kind, tmp_path):
     check_disc(scene)
 
 
-@pytest.mark.parametrize("after", [".png.png", ".mask.png"])
-def test_a_mask_that_is_not_found_is_missed(after, tmp_path):
+MASKS = [
+    "masks/{0}.png.png",
+    "masks/{0}.png",
+    "masks/{0}.jpg",
+    "mask/{0}_mask.png",
+    "masks/{0}.mask.png",
+    "masks/images/{0}.png.png",
+    "images/masks/{0}.png",
+    "images/{0}_mask.png",
+    "images/{0}.mask.png",
+    "images/{0}.png.png",
+    "images/{0}.png.mask.png",
+]
+
+
+@pytest.mark.parametrize(
+    ("layout", "place"),
+    [*(("nerfstudio", place) for place in MASKS), *(("cubes", place) for place in MASKS[:1] + MASKS[-5:-2])],
+)
+def test_a_mask_is_found_under_the_names_that_programs_give_it(layout, place, tmp_path):
+    write_pictures(tmp_path)
+    for name in PICTURES:
+        path = tmp_path / place.format(name)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        mask_picture("0 and 255").save(path, quality=95)
+    write_transforms(tmp_path / "transforms.json", [f"images/{name}.png" for name in PICTURES])
+    data = tmp_path / "images" if layout == "cubes" else tmp_path
+    words = layout, "--data", data, *RGB, "--mask", "files", "--poses", tmp_path / "transforms.json"
+    scene = processed(*words, output=tmp_path / "scene")
+    assert len(scene.views) == VIEWS
+    check_disc(scene)
+
+
+@pytest.mark.parametrize(
+    "place", ["masks/{0}.hdr.png", "data/masks/{0}.png", "data/{0}.hdr.png", "masks/{0}.raw.png"]
+)
+def test_a_mask_of_a_cube_is_found(place, tmp_path):
+    write_cubes(tmp_path / "data")
+    for name in CUBES:
+        path = tmp_path / place.format(name)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        mask_picture("0 and 255").save(path)
+    write_transforms(tmp_path / "transforms.json", [f"{name}.hdr" for name in CUBES])
+    words = "cubes", "--data", tmp_path / "data", "--mask", "files", "--poses", tmp_path / "transforms.json"
+    check_disc(processed(*words, output=tmp_path / "scene"))
+
+
+def test_masks_lie_in_the_folders_of_their_images(tmp_path):
+    """As COLMAP has them of several cameras, with the same names in each."""
+    names = [f"{camera}/{index:04d}" for index in range(VIEWS) for camera in ("left", "right")]
+    for index, name in enumerate(names):
+        path = tmp_path / f"images/{name}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(np.rint(cube(index // 2)[..., RED_GREEN_BLUE] * 255).astype(np.uint8)).save(path)
+        mask = tmp_path / f"masks/{name}.png.png"
+        mask.parent.mkdir(parents=True, exist_ok=True)
+        shown = DISC if "left" in name else ~DISC
+        Image.fromarray((shown * 255).astype(np.uint8)).save(mask)
+    frames = [
+        {"file_path": f"images/{name}.png", "transform_matrix": pose.tolist()}
+        for name, pose in zip(names, ring(len(names)), strict=True)
+    ]
+    lens = {"fl_x": FOCAL_PX, "fl_y": FOCAL_PX, "cx": WIDTH / 2, "cy": HEIGHT / 2, "w": WIDTH, "h": HEIGHT}
+    (tmp_path / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))
+    scene = processed("nerfstudio", "--data", tmp_path, *RGB, "--mask", "files", output=tmp_path / "scene")
+    for view in scene.views:
+        alpha = np.asarray(Image.open(tmp_path / "scene/images" / f"{view.name}.png"))[..., 3] > 127
+        assert (alpha == (DISC if "left" in view.name else ~DISC)).mean() > 0.95, view.name
+
+
+def test_a_mask_that_is_not_found_is_missed_with_the_places_that_were_looked_in(tmp_path):
     write_pictures(tmp_path)
     (tmp_path / "masks").mkdir()
-    for name in PICTURES:
-        mask_picture("0 and 255").save(tmp_path / f"masks/{name}{after}")
+    for name in PICTURES[1:]:
+        mask_picture("0 and 255").save(tmp_path / f"masks/{name}.png")
     write_transforms(tmp_path / "transforms.json", [f"images/{name}.png" for name in PICTURES])
     words = "nerfstudio", "--data", tmp_path, *RGB, "--mask", "files"
-    assert "view 0000 has no mask" in not_processed(*words, output=tmp_path / "scene")
+    said = not_processed(*words, output=tmp_path / "scene")
+    for part in ("view 0000 has no mask", "0000.png.png", str(tmp_path / "masks"), str(tmp_path / "images")):
+        assert part in said
 
 
 @pytest.mark.parametrize("delimiter", [",", ";", "\t"])

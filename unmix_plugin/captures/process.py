@@ -22,6 +22,7 @@ from unmix_plugin.captures.cube import (
 )
 from unmix_plugin.captures.decisions import decisions_of
 from unmix_plugin.captures.finding_poses import check_pose_options, marked_poses, poses_of_written_views
+from unmix_plugin.captures.layouts.masks import with_mask_files
 from unmix_plugin.captures.match_checks import views_of_other_poses
 from unmix_plugin.captures.options import GONE_LAYOUTS, LAYOUTS, ProcessOptions, find_views
 from unmix_plugin.captures.plan import Plan, hashes, input_files, make_plan
@@ -261,6 +262,8 @@ def _open_capture(options: ProcessOptions, references: Sequence[Cube | None]) ->
         named += (Path(options.poses), options.data / options.poses)
     asked = ReadOptions(options.dataset, wavelengths, options.axes, exclude=named)
     capture = _by_size(find_views(options.layout, options.data, asked))
+    if options.mask == "files":
+        capture = with_mask_files(capture)
     first: dict[str, Cube] = {}
     for view in capture.views:
         _refuse_unlike(view.cube, first.setdefault(view.sensor, view.cube))

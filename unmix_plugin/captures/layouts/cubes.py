@@ -23,6 +23,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from unmix_plugin.captures.cube import Capture, CaptureView, Cube, ReadOptions
+from unmix_plugin.captures.layouts.masks import MASK_FOLDERS, is_mask_of
 from unmix_plugin.captures.names import natural_order, view_names
 from unmix_plugin.captures.readers.envi import described_image
 from unmix_plugin.captures.readers.opening import open_spectral_file
@@ -76,7 +77,10 @@ def find_cubes(root: Path, options: ReadOptions) -> Capture:
     folders = _band_folders(root, excluded)
     if not folders and (deeper := _cubes_below(root, excluded)):  # references may lie in the folder itself
         return _capture_of_groups(root, deeper, options)
-    shown = folders or [path for path in plain.values() if not _is_reference(path, ())]
+    pictures = [*plain.values()]
+    shown = folders or [
+        path for path in pictures if not _is_reference(path, ()) and not is_mask_of(path, pictures)
+    ]
     if not shown:
         kinds = ", ".join(sorted(_CUBE_SUFFIXES | _PICTURE_SUFFIXES))
         raise CaptureError(
@@ -255,6 +259,7 @@ def _visible_files(folder: Path) -> list[Path]:
 def _band_folders(root: Path, excluded: set[Path]) -> list[Path]:
     """Folders that hold more than one file of a band, and no cube, each a view."""
     folders = [path for path in root.iterdir() if path.is_dir() and not path.name.startswith(".")]
+    folders = [path for path in folders if path.name.lower() not in MASK_FOLDERS]
     folders = [path for path in folders if path.resolve() not in excluded and not _is_reference(path, ())]
     suffixes = [[file.suffix.lower() for file in _visible_files(path)] for path in folders]
     return sorted(

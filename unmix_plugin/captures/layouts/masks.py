@@ -1,0 +1,105 @@
+"""Mask files of views, under every name and in every place that programs give them.
+
+| program | the mask of images/0001.jpg |
+|---|---|
+| COLMAP | masks/0001.jpg.png, or masks/0001.png |
+| OpenSfM, OpenDroneMap | masks/0001.jpg.png; images/0001_mask.jpg |
+| nerfstudio, trainers of splats | masks/0001.png, masks/0001.jpg; `mask_path` of transforms.json, which goes first |
+| Metashape, RealityCapture | 0001_mask.png, 0001.mask.png, 0001.jpg.mask.png beside the image or in a folder |
+
+Folders below images/ are the same below masks/. Sources: colmap 2599, 3611; OpenSfM 551; nv-tlabs/3dgrut 61.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+
+from unmix_plugin.captures.cube import Capture, CaptureView
+from unmix_plugin.captures.writing.view_files import alpha_picture
+from unmix_plugin.errors import CaptureError, name_some
+from unmix_plugin.scenes.reading.faults import find_named
+
+_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
+_MARKS = ("_mask", ".mask", "-mask")
+MASK_FOLDERS = ("masks", "mask")
+
+
+def with_mask_files(capture: Capture) -> Capture:
+    """The capture with a mask for each view that has neither one nor an alpha channel. Raises CaptureError: a view has
+    none, with where it was looked for."""
+    views = []
+    for view in capture.views:
+        if view.mask is None and view.alpha is None and alpha_picture(view) is None:
+            view = replace(view, mask=_find_mask(view, capture.root))
+            if view.mask is None:
+                _refuse(view, capture)
+        views.append(view)
+    return replace(capture, views=tuple(views))
+
+
+def is_mask_of(path: Path, others: Iterable[Path]) -> bool:
+    """Whether a picture is by its name the mask of another file of its folder."""
+    files = {other.name for other in others} | {other.stem for other in others if other != path}
+    marked = [path.stem.removesuffix(mark) for mark in _MARKS if path.stem.endswith(mark)]
+    return any(name in files for name in marked) or (Path(path.stem).suffix != "" and path.stem in files)
+
+
+def _find_mask(view: CaptureView, root: Path) -> Path | None:
+    own = {path.resolve() for path in _images(view)}
+    for folder, name in _candidates(view, root):
+        found = find_named(folder, name)
+        if found is not None and found.resolve() not in own:
+            return found
+    return None
+
+
+def _images(view: CaptureView) -> list[Path]:
+    """Files that a mask may be named after: the cube's, and the picture of a view."""
+    return [*dict.fromkeys([*([view.picture] if view.picture else []), view.cube.path, *view.cube.files])]
+
+
+def _candidates(view: CaptureView, root: Path) -> list[tuple[Path, str]]:
+    """Folders and names, the plainest first."""
+    found = []
+    for image in _images(view):
+        stems = dict.fromkeys([image.name, image.stem, Path(image.stem).stem, view.name])
+        marked = [f"{stem}{mark}{suffix}" for stem in stems for mark in _MARKS for suffix in _SUFFIXES]
+        inside = [f"{stem}{suffix}" for stem in stems for suffix in _SUFFIXES]
+        found += [
+            (folder, name) for folder in _mask_folders(image.parent, root) for name in [*inside, *marked]
+        ]
+        beside = [f"{image.name}{suffix}" for suffix in _SUFFIXES]
+        found += [(image.parent, name) for name in [*beside, *marked]]
+    return [*dict.fromkeys(found)]
+
+
+def _mask_folders(folder: Path, root: Path) -> list[Path]:
+    """masks/ in and beside the folder of an image and those above it, with the folders that lie between."""
+    tops = [folder]
+    while tops[-1] != root and root in tops[-1].parents:
+        tops.append(tops[-1].parent)
+    tops.append(tops[-1].parent)
+    between = [folder.relative_to(top) for top in tops]
+    below = [path.parts[1:] for path in between]
+    return [
+        *dict.fromkeys(
+            top.joinpath(name, *inner)
+            for top, whole, own in zip(tops, between, below, strict=True)
+            for name in MASK_FOLDERS
+            for inner in (own, whole.parts, ())
+        )
+    ]
+
+
+def _refuse(view: CaptureView, capture: Capture) -> None:
+    candidates = _candidates(view, capture.root)
+    folders = [folder for folder in dict.fromkeys(folder for folder, _ in candidates) if folder.is_dir()]
+    names = [*dict.fromkeys(name for _, name in candidates if name.endswith(".png"))]
+    has_folder = any(folder.name in MASK_FOLDERS for folder in folders)
+    raise CaptureError(
+        f"--mask files: view {view.name} has no mask; expected an alpha channel, or a mask that is white where matter "
+        f"is, for every view. Looked for {name_some(names, 6)} in {name_some([str(one) for one in folders], 6)}"
+        + ("" if has_folder else "; there is no folder masks/ beside the images")
+    )
