@@ -12,8 +12,7 @@ from tests.captures.capture_factory import HEIGHT, WIDTH, make_capture, process
 from tests.captures.file_factory import file_of
 from unmix_plugin.captures.calibration.calibration import Calibration, Raster
 from unmix_plugin.captures.cube import CaptureView
-from unmix_plugin.captures.plan import _background_rule as background_rule
-from unmix_plugin.captures.plan import _choose_mask as choose_mask
+from unmix_plugin.captures.decide import background_rule, choose_mask
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.writing.view_files import UNLABELLED, ViewRecipe, alpha_picture, write_view
 from unmix_plugin.captures.writing.view_files import _clean as clean
@@ -136,6 +135,5 @@ def test_pixels_without_a_measurement_are_no_share_of_the_matter(tmp_path, first
 
 
 def test_views_of_a_rig_are_never_cut_out_of_a_backdrop_by_themselves():
-    views = [CaptureView(name, CUBE) for name in "ab"]
-    assert choose_mask(views, "auto") == ("auto", [])
-    assert choose_mask([replace(view, release="1") for view in views], "auto") == ("none", [])
+    assert choose_mask("auto", ["a", "b"], without=["a", "b"], is_rig=False) == ("auto", [])
+    assert choose_mask("auto", ["a", "b"], without=["a", "b"], is_rig=True) == ("none", [])

@@ -22,13 +22,13 @@ def test_many_places_are_counted_in_the_sentence():
 
 
 def test_kinds_are_properties_of_codes_and_tell_where_a_sentence_goes():
-    remarks = [Remark.of(Code.FILE_NOTE, text="odd"), Remark.of(Code.CAPTURE_WARNING, text="wrong")]
+    remarks = [Remark.of(Code.NOTE, text="odd"), Remark.of(Code.CAPTURE_WARNING, text="wrong")]
     assert sentences(remarks, Kind.WRONG) == ["wrong"]
     assert sentences(remarks, Kind.DONE) == ["odd"]
     assert [code for code in Code if code.looks_wrong] == [code for code in Code if code.kind is Kind.WRONG]
 
 
-@pytest.mark.parametrize("code", [Code.FILE_WARNING, Code.FILE_NOTE])
+@pytest.mark.parametrize("code", [Code.FILE_WARNING, Code.NOTE])
 def test_a_remark_is_written_with_its_code_and_values(code: Code):
     written = json.loads(json.dumps(Remark.of(code, ["a"], text="cut").to_json()))
     assert written == {"code": code.name.lower(), "where": ["a"], "values": {"text": "cut"}}

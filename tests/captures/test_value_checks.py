@@ -10,8 +10,8 @@ from PIL import Image
 
 from tests.captures.file_factory import file_of
 from unmix_plugin.captures.cube import BandTable, CaptureView
+from unmix_plugin.captures.decide import is_below_black
 from unmix_plugin.captures.options import ProcessOptions
-from unmix_plugin.captures.plan import _is_below_black as is_below_black
 from unmix_plugin.captures.value_checks import ViewSample, check_files, check_values
 from unmix_plugin.captures.writing.view_files import ViewRecord
 

@@ -8,9 +8,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from jaxtyping import Float64
 
-from unmix_plugin.captures.calibration.sensor import Sensor
 from unmix_plugin.captures.options import ProcessOptions
-from unmix_plugin.captures.plan import Plan
+from unmix_plugin.captures.plan import Plan, SensorPlan
 from unmix_plugin.captures.posing import PosedViews
 from unmix_plugin.captures.report import Remark
 from unmix_plugin.engine.decisions import UNDECIDED, Decision
@@ -26,12 +25,14 @@ def decisions_of(
     decisions = [_of_views(len(posed.views), left_out)]
     for name, sensor in plan.sensors.items():
         decisions += _of_sensor(f" of {name}" if name else "", sensor, options)
-    above = max((float((sensor.sample > plan.scale).mean()) for sensor in plan.sensors.values()), default=0.0)
+    above = max(
+        (float((sensor.sample > plan.scale.value).mean()) for sensor in plan.sensors.values()), default=0.0
+    )
     decisions.append(
         Decision(
             "scale",
-            f"{plan.scale:g} is written as 1",
-            {"sampled values above": above, "from": plan.decisions["scale"]["evidence"]},
+            f"{plan.scale.value:g} is written as 1",
+            {"sampled values above": above, "from": plan.scale.evidence},
             "views that are far brighter than most, which it does not follow",
             "--scale",
         )
@@ -52,8 +53,8 @@ def _of_views(used: int, left_out: Sequence[Remark]) -> Decision:
     )
 
 
-def _of_sensor(where: str, sensor: Sensor, options: ProcessOptions) -> Iterator[Decision]:
-    facts = sensor.evidence
+def _of_sensor(where: str, sensor: SensorPlan, options: ProcessOptions) -> Iterator[Decision]:
+    facts = sensor.references_used
     for key, what, against in (
         ("dark", "dark frame", "values that pile up below 0"),
         ("white", "white reference", "bands in which it is saturated, dark, or not above the dark frame"),
@@ -74,7 +75,7 @@ def _of_sensor(where: str, sensor: Sensor, options: ProcessOptions) -> Iterator[
         {},
         "a time, gain or f-number that one file states and another lacks; values that are reflectance already",
     )
-    stored, evidence = facts["saturation"]["stored"], facts["saturation"]["evidence"]
+    stored, evidence = sensor.saturation.stored, sensor.saturation.evidence
     yield Decision(
         f"saturation{where}",
         UNDECIDED if stored is None else f"from {stored:g}",
@@ -84,7 +85,8 @@ def _of_sensor(where: str, sensor: Sensor, options: ProcessOptions) -> Iterator[
     )
     dropped = sensor.bands.dropped
     nm = sensor.bands.wavelengths_nm
-    listed = {f"{nm[band]:g} nm": reason for band, reason in sorted(dropped.items())[:_MOST_LISTED]}
+    some = [(index, dropped[index].reason) for index in sorted(dropped)[:_MOST_LISTED]]
+    listed = {f"{nm[index]:g} nm": reason for index, reason in some}
     more = {"others": len(dropped) - len(listed)} if len(dropped) > len(listed) else {}
     yield Decision(
         f"bands{where}",

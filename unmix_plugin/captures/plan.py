@@ -1,4 +1,7 @@
-"""Everything that is decided before the first view is written."""
+"""Everything that is decided before the first view is written: samples are taken, and decisions from them.
+
+Notation: `N` sampled pixels, `c` bands of the scene.
+"""
 
 from __future__ import annotations
 
@@ -7,55 +10,130 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Bool, Float32, Float64
 
 from unmix_plugin import __version__
-from unmix_plugin.captures.calibration.exposures import ExposedFiles, compare_exposures, exposure_of
-from unmix_plugin.captures.calibration.sensor import (
-    BRIGHT_PERCENTILE,
-    Sensor,
-    may_be_reflectance,
-    prepare_sensor,
-    sampled_rows,
+from unmix_plugin.captures.calibration.bands import BandChoice, stated_bands, without_bad, without_unlit
+from unmix_plugin.captures.calibration.calibration import Calibration, Raster
+from unmix_plugin.captures.calibration.exposures import (
+    ComparedExposures,
+    ExposedFiles,
+    compare_exposures,
+    exposure_of,
 )
+from unmix_plugin.captures.calibration.references import GivenReferences, SensorReferences, find_references
 from unmix_plugin.captures.camera_tags import radiometric_model
 from unmix_plugin.captures.cube import Capture, CaptureView, Cube
+from unmix_plugin.captures.decide import (
+    Saturation,
+    Scale,
+    ValueMeaning,
+    background_rule,
+    choose_mask,
+    choose_scale,
+    doubts_of_scale,
+    find_meaning,
+    find_saturation,
+    is_below_black,
+    may_be_reflectance,
+    saturated_bands,
+    usual_pixels,
+)
 from unmix_plugin.captures.options import MaskKind, ProcessOptions, plain_options
 from unmix_plugin.captures.poses.pose_set import PosedCamera, reading
-from unmix_plugin.captures.report import Code, Kind, Remark, sentences
+from unmix_plugin.captures.report import Code, Remark
+from unmix_plugin.captures.sample import (
+    PixelSample,
+    WhiteSample,
+    border_pixels,
+    bright_values,
+    count_stored,
+    draw_pixels,
+    rows_behind,
+)
+from unmix_plugin.captures.spoilt import judge_values
 from unmix_plugin.captures.writing.view_files import BackgroundRule, ViewRecipe, alpha_picture
 from unmix_plugin.engine.sampling import evenly_spaced
-from unmix_plugin.errors import CaptureError, ConfigError, name_some
 from unmix_plugin.scenes.backdrops import Backdrop, judge_backdrop
 from unmix_plugin.scenes.reading.faults import sha256_of
 from unmix_plugin.spectral.bands import Bands
 
-_LOOKED_AT, _ROWS_LOOKED_AT = 12, 96
-"""Views that a backdrop is looked for in, and rows of each."""
+_BACKDROP_VIEWS = 12
+"""Views that a backdrop is looked for in."""
 _WHITE_PERCENTILE = 99.0
 """Of sampled pixels; shown as white in pictures."""
-_DEVIATIONS = 6.0
-"""Standard deviations of the background's noise between its level and the threshold."""
-_LEAST_DISTANCE = 0.02
-"""Between level and threshold, as a share of the brightest pixels; JPEG and shading vary a background by about this."""
-_LEAST_WHITE, _MOST_BLACK = 0.5, 0.2
-"""Level of a white or black background, as a share of the brightest pixels."""
-_BORDER_SHARE = 0.02
-"""Width of the border that a background is judged by, as a share of the view's."""
-_MOST_BORDER_PIXELS = 20000
-_BRIGHTEST_PERCENTILE = 99.0
-_MOST_ABOVE_ONE = 0.01
-"""Share of reflectances above 1 that is still taken for highlights."""
-_LEAST_BRIGHT = 0.05
-"""Bright values below this would lose digits if they were kept."""
 _LEAST_END = 0.9
 """Of what is written as 1: saturated values below are too far off. Columns and bands differ in their ends a little."""
-_MOST_BELOW, _LEAST_LEVEL, _PILED_UP = 0.02, 0.005, 0.84
-"""Share of a band's values below 0, and their mean over what is bright and over their root mean square, above which a
-level was taken off: of noise around black the last is 0.8, of a level 1."""
+_FEW_PERCENTILE = 5.0
+"""Of saturated values: nearly the darkest."""
+
+
+@dataclass(frozen=True)
+class SensorPlan:
+    """How all views of one lens or camera are calibrated, and why."""
+
+    calibration: Calibration
+    bands: BandChoice
+    saturation: Saturation
+    meaning: ValueMeaning
+    sample: Float32[np.ndarray, "N c"]
+    """Calibrated pixels of all views, on the bands of the scene."""
+    is_usual: Bool[np.ndarray, " N"] | None = None
+    """Sampled pixels of views that are not far brighter than most; None if all are."""
+    saturated_from: float = np.inf
+    """Calibrated value of nearly the darkest of sampled numbers that are saturated."""
+    lamp: Float64[np.ndarray, " c"] | None = None
+    """Light on the white panel as the detector sees it, greatest value 1."""
+    irradiance: Mapping[str, float] = field(default_factory=dict)
+    """What sunshine sensors measured, by view; not used."""
+    remarks: tuple[Remark, ...] = ()
+    left_out: Mapping[str, Remark] = field(default_factory=dict)
+    """Views that nothing was decided from, as they are spoilt, and why."""
+
+    @property
+    def usual_sample(self) -> Float32[np.ndarray, "M c"]:
+        """The sample without views that are far brighter than most."""
+        return self.sample if self.is_usual is None else self.sample[self.is_usual]
+
+    @property
+    def centers_nm(self) -> Float64[np.ndarray, " c"]:
+        """Bands of the scene."""
+        return self.bands.centers_nm(self.calibration.bin_bands)
+
+    @property
+    def references_used(self) -> dict[str, dict[str, str]]:
+        """Files of `dark` and `white`, where there are such, and how they are used, for people."""
+        references = self.calibration.references
+        used: dict[str, dict[str, str]] = {}
+        first = next(iter(references.own.values()), references.common)
+        for name in ("dark", "white"):
+            of_view, of_all = getattr(first, name), getattr(references.common, name)
+            if references.own and of_view is not None:
+                used[name] = {"file": "each view's own", "use": f"each view's own; {of_view.how}"}
+            elif of_all is not None:
+                used[name] = {"file": str(of_all.file.path), "use": of_all.how}
+        return used
+
+    def to_json(self) -> dict[str, Any]:
+        """What was decided and from what, for the record."""
+        dropped = [
+            {
+                "band": index,
+                "wavelength_nm": float(self.bands.wavelengths_nm[index]),
+                "reason": band.reason,
+            }
+            for index, band in sorted(self.bands.dropped.items())
+        ]
+        facts = {
+            "saturation": {"stored": self.saturation.stored, "evidence": self.saturation.evidence},
+            **self.references_used,
+            "wavelengths": self.bands.source,
+            "dropped_bands": dropped,
+        }
+        return facts | ({"irradiance": dict(self.irradiance)} if self.irradiance else {})
 
 
 @dataclass(frozen=True)
@@ -64,21 +142,36 @@ class Plan:
 
     capture: Capture
     views: tuple[CaptureView, ...]
-    sensors: dict[str, Sensor]
+    sensors: dict[str, SensorPlan]
     recipes: dict[str, ViewRecipe]
     """By sensor."""
-    scale: float
+    scale: Scale
     mask: MaskKind
-    decisions: dict[str, Any]
-    """With their evidence, as JSON-able values."""
-    notes: tuple[str, ...]
-    """What a user should know, one sentence each."""
-    warnings: tuple[str, ...] = ()
-    """What may make values, wavelengths or geometry wrong, one sentence each."""
+    remarks: tuple[Remark, ...]
+    """What a user should know."""
     option_files: tuple[Path, ...] = ()
     """What options name: dark frame, white reference, tables of its reflectance and of wavelengths."""
     left_out: Mapping[str, Remark] = field(default_factory=dict)
     """Views that nothing was decided from, as they are spoilt, and why."""
+
+    @property
+    def decisions(self) -> dict[str, Any]:
+        """With their evidence, as JSON-able values."""
+        from unmix_plugin.spectral.colour.conversion import describe_colour
+
+        each = {}
+        for name, sensor in self.sensors.items():
+            raster, rule = sensor.calibration.raster, self.recipes[name].background
+            each[name or "all views"] = {
+                "unit": sensor.meaning.description,
+                "bands": len(sensor.centers_nm),
+                "size": [raster.height, raster.width],
+                "colours": describe_colour(Bands(sensor.centers_nm)),
+                **sensor.to_json(),
+                "background": None if rule is None else rule.evidence,
+            }
+        scale = {"calibrated": self.scale.value, "evidence": self.scale.evidence}
+        return {"scale": scale, "mask": self.mask, "sensors": each}
 
     def fingerprint(self, options: ProcessOptions) -> dict[str, Any]:
         """What must be the same for views to be gone on with: options, decisions and input files."""
@@ -106,84 +199,63 @@ def make_plan(
     capture: Capture,
     views: Sequence[CaptureView],
     options: ProcessOptions,
-    references: tuple[Cube | None, Cube | None],
+    given: GivenReferences,
     cameras: Mapping[str, PosedCamera] | None = None,
 ) -> Plan:
     """Look at some rows of every view and decide.
 
     Args:
         views: Those of the capture that become frames.
-        references: Dark frame and white reference that the user names.
+        given: References that the user names.
         cameras: By view, if they are known.
     Raises:
         CaptureError: views don't fit each other or the references, or a file can't be read.
         ConfigError: an option does not fit the files.
     """
-    from unmix_plugin.spectral.colour.conversion import describe_colour, rgb_matrix
-
     by_sensor: dict[str, list[CaptureView]] = defaultdict(list)
     for view in views:
         by_sensor[view.sensor].append(view)
-    sensors: dict[str, Sensor] = {}
+    sensors: dict[str, SensorPlan] = {}
     for name, same in by_sensor.items():
         # Views of several sizes are several sensors, and one may show the panel of all.
         every = [v for v in capture.views if v.sensor == name or not (name and v.release)]
-        sensors[name] = prepare_sensor(same, options, references, every, cameras)
-    sensors = _with_one_exposure(sensors, {name: same[0].cube for name, same in by_sensor.items()})
+        sensors[name] = plan_sensor(same, options, given, every, cameras)
+    sensors = with_one_exposure(sensors, {name: same[0].cube for name, same in by_sensor.items()})
     left_out = {name: remark for sensor in sensors.values() for name, remark in sensor.left_out.items()}
     sound = {name: [view for view in same if view.name not in left_out] for name, same in by_sensor.items()}
-    scale, why = _choose_scale(list(sensors.values()), options.scale)
-    mask, said_of_mask = _choose_mask(views, options.mask)
-    samples = {name: sensor.sample / np.float32(scale) for name, sensor in sensors.items()}
-    backdrops: dict[str, Backdrop | None] = {}
+
+    meanings = [sensor.meaning for sensor in sensors.values()]
+    usual = [sensor.usual_sample.ravel() for sensor in sensors.values()]
+    scale = choose_scale(meanings, np.concatenate(usual), options.scale)
+
+    is_rig = any(view.release for view in views)
+    without = []
+    if options.mask in ("auto", "files"):
+        without = [view.name for view in views if not _has_opacity(view, options.mask == "files")]
+    names = [view.name for view in views]
+    mask, remarks_on_mask = choose_mask(options.mask, names, without, is_rig)
+    backgrounds = _backgrounds(mask, sensors, sound, scale.value)
+    if mask == "auto" and None in backgrounds.values():  # frames with alpha and without don't go together
+        backgrounds, mask = dict.fromkeys(sensors), "none"
     if mask == "auto":
-        backdrops = {n: _find_backdrop(s, sound[n], scale, samples[n]) for n, s in sensors.items()}
-        if not all(backdrops.values()):  # frames with alpha and without don't go together
-            backdrops, mask = {}, "none"
-    recipes: dict[str, ViewRecipe] = {}
-    evidence: dict[str, dict[str, Any]] = {}
-    for name, sensor in sensors.items():
-        raster = sensor.calibration.raster
-        to_rgb = rgb_matrix(Bands(sensor.centers_nm)).numpy()
-        shown = (samples[name] @ to_rgb).max(axis=1)
-        white = float(np.percentile(shown, _WHITE_PERCENTILE)) if len(shown) else 0.0
-        to_rgb = to_rgb / np.float32(white) if white > 0 else to_rgb
-        rule: BackgroundRule | Backdrop | None = backdrops.get(name)
-        if mask in ("white", "black"):
-            rule = _background_rule(mask, _border_pixels(sensor, sound[name], scale), samples[name])
-        recipes[name] = ViewRecipe(sensor.calibration, scale, to_rgb, rule, mask == "files")
-        evidence[name or "all views"] = {
-            "unit": sensor.unit,
-            "bands": len(sensor.centers_nm),
-            "size": [raster.height, raster.width],
-            "colours": describe_colour(Bands(sensor.centers_nm)),
-            **sensor.evidence,
-            "background": None if rule is None else rule.evidence,
-        }
-    decisions = {"scale": {"calibrated": scale, "evidence": why}, "mask": mask, "sensors": evidence}
-    remarks = [remark for sensor in sensors.values() for remark in sensor.remarks]
-    said = [*sentences(remarks, Kind.DONE), *said_of_mask]
-    if found := [backdrop for backdrop in backdrops.values() if backdrop is not None]:
-        said.append(
-            f"a backdrop was found that all views share, {', '.join(each.in_words for each in found)}, and is cut out: "
-            "look at contact-sheet.png; --mask none keeps it"
+        found = [each.in_words for each in backgrounds.values() if isinstance(each, Backdrop)]
+        remarks_on_mask.append(Remark.of(Code.BACKDROP_FOUND, backdrops=", ".join(found)))
+    if options.mask == "auto" and mask == "none" and not is_rig:
+        remarks_on_mask.append(Remark.of(Code.NO_MASK_FOUND))
+    recipes = {
+        name: ViewRecipe(
+            sensor.calibration,
+            scale.value,
+            _colours_of(sensor, scale.value),
+            backgrounds[name],
+            use_opacity=mask == "files",
         )
-    said += _notes_on_pictures([view.cube for view in views])
-    said += dict.fromkeys(note for view in views for note in view.cube.notes)
-    opened = [file for file in references if file is not None]
+        for name, sensor in sensors.items()
+    }
+    files = [(view.name, file) for view in views for file in (view.cube, *view.references)]
+    files += [(file.path.name, file) for file in given.files]
     texts = (options.wavelengths or "", options.white_reflectance)  # numbers, or the name of a table
     tables = filter(os.path.isfile, texts)
-    warned = sentences(remarks, Kind.WRONG)
-    warned += _doubts_of_values([*sensors.values()], 1.0 if options.scale is not None else scale)
-    warned += sentences(_doubts_of_meaning(options, mask, views, [*sensors.values()]), Kind.WRONG)
-    end = min(sensor.saturated_from for sensor in sensors.values())
-    if end < _LEAST_END * scale:
-        warned.append(
-            f"values are saturated from {end:.3g} on, and are written as 1, which is read as at least {scale:g}: "
-            f"expose less, or make that true with --scale {end:.3g}, which cuts off all above"
-        )
-    each = [(view.name, file) for view in views for file in (view.cube, *view.references)]
-    each += [(file.path.name, file) for file in opened]
     return Plan(
         capture,
         tuple(views),
@@ -191,22 +263,130 @@ def make_plan(
         recipes,
         scale,
         mask,
-        decisions,
-        (*capture.notes, *said),
-        (*capture.warnings, *warned, *_warnings_of_files(each)),
-        (*(path for file in opened for path in file.files), *map(Path, tables)),
-        left_out,
+        remarks=(
+            *(Remark.of(Code.NOTE, text=text) for text in capture.notes),
+            *(Remark.of(Code.CAPTURE_WARNING, text=text) for text in capture.warnings),
+            *(remark for sensor in sensors.values() for remark in sensor.remarks),
+            *doubts_of_values(sensors, scale),
+            *remarks_on_mask,
+            *_doubts_of_kinds(sensors, scale, views),
+            *_remarks_on_pictures([view.cube for view in views]),
+            *(Remark.of(Code.NOTE, text=text) for view in views for text in view.cube.notes),
+            *(
+                Remark.of(Code.FILE_WARNING, [name], text=text)
+                for name, file in files
+                for text in file.warnings
+            ),
+        ),
+        option_files=(*(path for file in given.files for path in file.files), *map(Path, tables)),
+        left_out=left_out,
     )
 
 
-def _with_one_exposure(sensors: dict[str, Sensor], first: dict[str, Cube]) -> dict[str, Sensor]:
+def plan_sensor(
+    views: Sequence[CaptureView],
+    options: ProcessOptions,
+    given: GivenReferences,
+    all_views: Sequence[CaptureView],
+    cameras: Mapping[str, PosedCamera] | None = None,
+) -> SensorPlan:
+    """Look at some rows of every view and decide how they are calibrated.
+
+    Args:
+        views: At least one; all have the same bands and size.
+        given: References that the user names.
+        all_views: With those that have no pose: one may show a panel.
+        cameras: By view, if they are known.
+    Raises:
+        CaptureError: references don't fit, wavelengths are unknown, no band is left, or a file can't be read.
+        ConfigError: an option does not fit the files.
+    """
+    files = [view.cube for view in views]
+    first, binning = files[0], options.bin_bands
+    model = radiometric_model(first)
+    bands = stated_bands(files, options)
+    references = find_references(views, bands.wavelengths_nm, options, given, all_views)
+    if options.saturation is not None:
+        saturation = Saturation(options.saturation, "given with --saturation")
+    elif model is not None:
+        saturation = Saturation(model.saturated, f"known of {model.maker}")
+    else:
+        saturation = find_saturation(count_stored(files, bands.kept))
+    remarks: list[Remark] = []
+    for white in references.whites:
+        bands, found = without_unlit(bands, white, saturated_bands(WhiteSample.of(white), saturation.stored))
+        remarks += found
+    bands.require(binning, str(first.path))
+    compared = ComparedExposures()
+    if model is None:  # a maker's calibration accounts for exposures already
+        compared = compare_exposures(_exposed_files(files, references))
+
+    raster = Raster.of(first.shape[0], first.shape[1], options.crop, options.bin_pixels)
+    calibration = Calibration(raster, bands.kept, 1, references, saturation.stored, compared.common)
+    drawn = draw_pixels(views, calibration)
+    spoilt = judge_values(drawn, cameras)
+    left_out = {name: remark for name, remark in spoilt.items() if name not in options.keep_view}
+    pixels = PixelSample(tuple(view for view in drawn if view.name not in left_out))
+    pixels.require(first.path)
+    values, saturated = pixels.values, pixels.saturated
+
+    bands, found = without_bad(bands, values, saturated, options.max_noise)
+    bands = bands.without_incomplete_bins(binning)
+    bands.require(binning, str(first.path))
+    still_kept = np.isin(calibration.bands, bands.kept)
+    at_end = values[:, still_kept][saturated[:, still_kept]]
+    models = {view.name: radiometric_model(view.cube) for view in views}
+    light = {name: own.irradiance for name, own in models.items() if own and own.irradiance is not None}
+    return SensorPlan(
+        replace(calibration, bands=bands.kept, bin_bands=binning),
+        bands,
+        saturation,
+        find_meaning(files, bool(references.whites)),
+        values[:, still_kept].reshape(len(values), -1, binning).mean(axis=2),
+        is_usual=usual_pixels(pixels.views, still_kept),
+        saturated_from=float(np.percentile(at_end, _FEW_PERCENTILE)) if len(at_end) else np.inf,
+        lamp=_lamp_of(references, bands, binning),
+        irradiance=light,
+        remarks=(*remarks, *compared.remarks, *found),
+        left_out=left_out,
+    )
+
+
+def _lamp_of(
+    references: SensorReferences, bands: BandChoice, binning: int
+) -> Float64[np.ndarray, " c"] | None:
+    """Light on the first white panel as the detector sees it, greatest value 1."""
+    if not references.whites:
+        return None
+    white = references.whites[0]
+    lamp = (white.signal / white.reflectance)[bands.kept].astype(np.float32)
+    lamp = lamp.reshape(-1, binning).mean(axis=1).astype(np.float64)
+    return np.clip(lamp, 0.0, None) / lamp.max()
+
+
+def _exposed_files(files: Sequence[Cube], references: SensorReferences) -> ExposedFiles:
+    """The files of one sensor with their references, to compare exposures."""
+    return ExposedFiles(
+        files,
+        [white.file for white in references.whites],
+        references.darks_beside(files),
+        is_srgb=files[0].is_srgb,
+        may_be_reflectance=may_be_reflectance(files[0], bright_values(files)),
+    )
+
+
+def with_one_exposure(sensors: dict[str, SensorPlan], first: dict[str, Cube]) -> dict[str, SensorPlan]:
     """The sensors with those brought to one exposure that have no white reference: lenses of a rig, which are exposed
     each for its own band, or views of one camera in several sizes. The first one says what was done, or was not.
 
     Args:
         first: File of the first view of each.
     """
-    bare = {name: one.calibration.exposure for name, one in sensors.items() if "white" not in one.evidence}
+    bare = {
+        name: sensor.calibration.exposure
+        for name, sensor in sensors.items()
+        if not sensor.calibration.references.whites
+    }
     known = {name: exposure for name, exposure in bare.items() if exposure is not None}
     rest = [name for name in bare if name not in known]
     files = [
@@ -218,11 +398,12 @@ def _with_one_exposure(sensors: dict[str, Sensor], first: dict[str, Cube]) -> di
     ]
     if len(bare) < 2 or not files:
         return sensors
-    is_bent, is_finished = (
-        any(file.is_srgb for file in files),
-        any(may_be_reflectance([file]) for file in files),
+    exposed = ExposedFiles(
+        files,
+        is_srgb=any(file.is_srgb for file in files),
+        may_be_reflectance=any(may_be_reflectance(file, bright_values([file])) for file in files),
     )
-    compared = compare_exposures(ExposedFiles(files, is_srgb=is_bent, may_be_reflectance=is_finished))
+    compared = compare_exposures(exposed)
     common = compared.common
     remarks = [one for one in compared.remarks if one.code.looks_wrong or known or common is None]
     if known and rest:
@@ -237,161 +418,77 @@ def _with_one_exposure(sensors: dict[str, Sensor], first: dict[str, Cube]) -> di
     return brought
 
 
-def _doubts_of_meaning(
-    options: ProcessOptions, mask: MaskKind, views: Sequence[CaptureView], sensors: Sequence[Sensor]
+def doubts_of_values(sensors: Mapping[str, SensorPlan], scale: Scale) -> Iterator[Remark]:
+    """What may be wrong with the references, by the values that come of them."""
+    has_white = any(sensor.calibration.references.whites for sensor in sensors.values())
+    yield from doubts_of_scale([sensor.meaning for sensor in sensors.values()], scale, has_white)
+    if any(is_below_black(sensor.sample) for sensor in sensors.values()):
+        yield Remark.of(Code.BELOW_BLACK)
+
+
+def _doubts_of_kinds(
+    sensors: Mapping[str, SensorPlan], scale: Scale, views: Sequence[CaptureView]
 ) -> Iterator[Remark]:
-    """A mask that was looked for and not found, and sensors whose values are of different kinds."""
-    if options.mask == "auto" and mask == "none" and not any(view.release for view in views):
-        yield Remark.of(Code.NO_MASK_FOUND)
-    kinds = {(one.is_absolute, one.is_stated): one.unit for one in sensors}
+    """Sensors whose values are of different kinds, and saturated values that are written as more than they may be."""
+    meanings = [sensor.meaning for sensor in sensors.values()]
+    kinds = {(meaning.has_one, meaning.states_one): meaning.description for meaning in meanings}
     if len(kinds) > 1 and not any(view.cube.is_srgb for view in views):
         yield Remark.of(Code.UNLIKE_MEANINGS, kinds=[*kinds.values()])
+    end = min(sensor.saturated_from for sensor in sensors.values())
+    if end < _LEAST_END * scale.value:
+        yield Remark.of(Code.SATURATED_BELOW_ONE, end=f"{end:.3g}", scale=f"{scale.value:g}")
 
 
-def _doubts_of_values(sensors: Sequence[Sensor], found_scale: float) -> Iterator[str]:
-    """What may be wrong with the references, by the values that come of them, one sentence each."""
-    if found_scale != 1.0 and all(sensor.is_stated for sensor in sensors):
-        units = ", ".join(dict.fromkeys(sensor.unit for sensor in sensors))
-        why = f"more than {_MOST_ABOVE_ONE:.0%} are above 1"
-        why = why if found_scale > 1 else f"nearly all are below {_LEAST_BRIGHT:g}"
-        if any("white" in sensor.evidence for sensor in sensors):
-            why += " (was the white exposed and lit as the views were?)"
-        yield (
-            f"values ({units}) were divided by {found_scale:g}, as {why}: outputs of reflectance undo it, and "
-            f"exported radiance times {found_scale:g} is what was measured; --scale 1 keeps values, and cuts off those "
-            "above 1"
-        )
-    if any(_is_below_black(sensor.sample) for sensor in sensors):
-        yield (
-            "values lie below 0 by more than noise, and are written as 0: the dark frame is brighter than that of "
-            "these views, or was taken off their numbers before"
-        )
+def _colours_of(sensor: SensorPlan, scale: float) -> Float32[np.ndarray, "c 3"]:
+    """From spectra to linear red, green and blue, in which bright pixels of the sample are white."""
+    from unmix_plugin.spectral.colour.conversion import rgb_matrix
+
+    to_rgb = rgb_matrix(Bands(sensor.centers_nm)).numpy()
+    shown = ((sensor.sample / np.float32(scale)) @ to_rgb).max(axis=1)
+    white = float(np.percentile(shown, _WHITE_PERCENTILE)) if len(shown) else 0.0
+    return to_rgb / np.float32(white) if white > 0 else to_rgb
 
 
-def _is_below_black(sample: Float32[np.ndarray, "N c"]) -> bool:
-    """Whether values pile up below 0 in half of the bands that have many there."""
-    below = np.clip(-sample.astype(np.float64), 0.0, None)
-    count, total = (below > 0).sum(axis=0), below.sum(axis=0)
-    judged = count > max(100, _MOST_BELOW * len(sample))
-    bright = np.percentile(sample, BRIGHT_PERCENTILE, axis=0)[judged]
-    count, total, below = count[judged], total[judged], below[:, judged]
-    piled = total > _PILED_UP * np.sqrt(count * (below**2).sum(axis=0))
-    return bool(judged.any()) and bool(np.mean(piled & (total > _LEAST_LEVEL * bright * count)) >= 0.5)
+def _has_opacity(view: CaptureView, may_be_mask: bool) -> bool:
+    """Whether files of a view tell its matter: an alpha channel, or its mask where that is asked for."""
+    return bool(view.alpha or alpha_picture(view) or (view.mask is not None and may_be_mask))
 
 
-def _choose_scale(sensors: Sequence[Sensor], given: float | None) -> tuple[float, str]:
-    """The scale and why.
-
-    Reflectances, and values of files that say what stands for 1, are kept unless many are above 1 or all are small;
-    others are divided by a high percentile. Raises CaptureError: nothing in the sampled pixels is above 0. Raises
-    ConfigError: the given scale is not above 0.
-    """
-    if given is not None:
-        if not (np.isfinite(given) and given > 0):
-            raise ConfigError(f"--scale {given:g}: expected a number above 0, what is written as 1")
-        return given, "given with --scale"
-    values = np.concatenate([sensor.usual_sample.ravel() for sensor in sensors])
-    bright = float(np.percentile(values, BRIGHT_PERCENTILE)) if len(values) else 0.0
-    if not bright > 0:
-        raise CaptureError(
-            f"{BRIGHT_PERCENTILE:g} % of the calibrated values are not above 0 (up to {values.max(initial=0):g}); "
-            "check the dark frame: is it as bright as the views?"
-        )
-    above = float((values > 1.0).mean())
-    if all(sensor.is_absolute for sensor in sensors) and above <= _MOST_ABOVE_ONE and bright >= _LEAST_BRIGHT:
-        return 1.0, f"values are kept ({sensors[0].unit}); {above:.2%} of the sampled ones are above 1"
-    scale = float(f"{bright:.4g}")
-    return scale, f"the {BRIGHT_PERCENTILE:g}th percentile of the sampled values"
+def _backgrounds(
+    mask: MaskKind,
+    sensors: Mapping[str, SensorPlan],
+    views: Mapping[str, Sequence[CaptureView]],
+    scale: float,
+) -> dict[str, BackgroundRule | Backdrop | None]:
+    """What tells the background of each sensor's views, if values do: a colour that is asked for, or a backdrop."""
+    found: dict[str, BackgroundRule | Backdrop | None] = dict.fromkeys(sensors)
+    for name, sensor in sensors.items():
+        calibration, sample = sensor.calibration, sensor.sample / np.float32(scale)
+        if mask in ("white", "black"):
+            border = border_pixels(views[name], calibration, scale)
+            found[name] = background_rule(mask, border, sample)
+        elif mask == "auto":
+            some = [views[name][index] for index in evenly_spaced(len(views[name]), _BACKDROP_VIEWS)]
+            found[name] = judge_backdrop((rows_behind(view, calibration, scale) for view in some), sample)
+    return found
 
 
-# Matter and background: from files of the capture, from a background that is white or black, or from a backdrop that
-# nobody has named. The border of the views tells how bright a background is and how much it varies; a threshold
-# between it and the rest follows from that.
+def _remarks_on_pictures(files: Sequence[Cube]) -> Iterator[Remark]:
+    """Encoding, order of colours and orientation; none where there is no picture."""
+    pictures = [file for file in files if file.reader == "picture"]
+    if any(file.is_srgb for file in pictures):
+        yield Remark.of(Code.PICTURES_ARE_SRGB)
+    for centres in (file.bands.wavelengths_nm for file in pictures):
+        if centres is not None and len(centres) == 3 and centres[0] < centres[2]:
+            red, green, blue = (f"{centre:g}" for centre in centres)
+            yield Remark.of(Code.COLOURS_IN_ORDER, red=red, green=green, blue=blue)
+            break
+    turned = sum(file.orientation != 1 for file in files)
+    if turned:
+        yield Remark.of(Code.ORIENTATION_IGNORED, turned=turned, files=len(files))
 
 
-def _choose_mask(views: Sequence[CaptureView], asked: MaskKind) -> tuple[MaskKind, list[str]]:
-    """What tells matter from background, `auto` where files don't, and what a user should know of it; the views of a
-    rig are left whole. CaptureError where opacity is asked of files that some views don't have."""
-    if asked not in ("auto", "files"):
-        return asked, []
-    missing = [
-        view.name
-        for view in views
-        if not (view.alpha or alpha_picture(view) or (view.mask is not None and asked == "files"))
-    ]
-    if not missing:
-        return "files", []
-    if asked == "files":
-        raise CaptureError(
-            f"--mask files: view {missing[0]} has no mask; expected an alpha channel, or a mask that is white where "
-            "matter is, for every view"
-        )
-    # What the lenses of a rig see from above is ground: a field or water is as plain as a backdrop and is the scene.
-    otherwise: MaskKind = "none" if any(view.release for view in views) else "auto"
-    if len(missing) == len(views):
-        return otherwise, []
-    has = "has" if len(missing) == 1 else "have"
-    note = (
-        f"{len(missing)} of {len(views)} views {has} no alpha channel ({name_some(missing)}), so that of the others is "
-        "not used: give all views one, or choose --mask"
-    )
-    return otherwise, [note]
-
-
-def _background_rule(
-    kind: Literal["white", "black"], border: Float32[np.ndarray, "M c"], sample: Float32[np.ndarray, "N c"]
-) -> BackgroundRule:
-    """The rule that fits the border of the views, beside a sample of all their pixels. CaptureError where most of the
-    border is not of this kind."""
-    brightness = BackgroundRule.brightness(kind, border)
-    everywhere = np.concatenate([BackgroundRule.brightness(kind, sample), brightness])
-    brightest = float(np.percentile(np.clip(everywhere, 0.0, 1.0), _BRIGHTEST_PERCENTILE))
-    level = float(np.median(brightness))
-    deviation = 1.4826 * float(np.median(np.abs(brightness - level)))
-    distance = max(_DEVIATIONS * deviation, _LEAST_DISTANCE * brightest)
-    share = level / brightest if brightest > 0 else 0.0
-    if (kind == "white" and share < _LEAST_WHITE) or (kind == "black" and share > _MOST_BLACK):
-        expected = f"more than {_LEAST_WHITE:.0%}" if kind == "white" else f"less than {_MOST_BLACK:.0%}"
-        raise CaptureError(
-            f"--mask {kind}: the border of the views is at {share:.0%} of the brightest pixels; expected {expected}, "
-            "as the background should reach to the border: choose another --mask"
-        )
-    threshold = level - distance if kind == "white" else level + distance
-    return BackgroundRule(kind, threshold, level, deviation)
-
-
-def _border_pixels(sensor: Sensor, views: Sequence[CaptureView], scale: float) -> Float32[np.ndarray, "M c"]:
-    """Pixels at the border of the views, in [0, 1]; saturated ones are 1, missing ones are left out."""
-    raster = sensor.calibration.raster
-    width = max(1, round(_BORDER_SHARE * raster.width))
-    columns = np.r_[0:width, raster.width - width : raster.width]
-    rows = sorted({0, raster.height - 1, *sampled_rows(raster.height)})
-    step = max(1, len(views) * (2 * raster.width + 2 * width * len(rows)) // _MOST_BORDER_PIXELS)
-    border = []
-    for view in views:
-        for row in rows:
-            part = sensor.calibration.rows(view.cube, row, row + 1)
-            shown = np.arange(raster.width) if row in (0, raster.height - 1) else columns
-            shown = shown[row % step :: step]
-            values = np.where(part.saturated[0, shown], np.float32(scale), part.values[0, shown])
-            border.append(values[~part.missing[0, shown]])
-    return np.clip(np.concatenate(border) / np.float32(scale), 0.0, 1.0)
-
-
-def _find_backdrop(
-    sensor: Sensor, views: Sequence[CaptureView], scale: float, sample: Float32[np.ndarray, "N B"]
-) -> Backdrop | None:
-    """The backdrop of a sensor's views, judged by some rows of some of them; the sample is of all, divided by scale."""
-    raster = sensor.calibration.raster
-    rows = np.unique(np.linspace(0, raster.height - 1, min(raster.height, _ROWS_LOOKED_AT)).astype(int))
-
-    def look(index: int) -> tuple[np.ndarray, np.ndarray]:
-        parts = [sensor.calibration.rows(views[index].cube, row, row + 1) for row in rows.tolist()]
-        values = np.concatenate([np.where(x.saturated, np.float32(scale), x.values) for x in parts])
-        seen = np.clip(values / np.float32(scale), 0.0, 1.0)
-        return seen, ~np.concatenate([part.missing for part in parts])
-
-    return judge_backdrop(map(look, evenly_spaced(len(views), _LOOKED_AT)), sample)
+# The files that a scene is made of.
 
 
 def input_files(view: CaptureView) -> list[Path]:
@@ -413,37 +510,3 @@ def _files_of(paths: Iterable[Path]) -> Iterator[Path]:
     """Files, and those of a folder that a reader takes as one."""
     for path in paths:
         yield from sorted(child for child in path.iterdir() if child.is_file()) if path.is_dir() else [path]
-
-
-def _warnings_of_files(files: Sequence[tuple[str, Cube | None]]) -> list[str]:
-    """What files warn of; one sentence where several warn of the same."""
-    found = [
-        Remark.of(Code.FILE_WARNING, [name], text=text)
-        for name, file in files
-        if file
-        for text in file.warnings
-    ]
-    return sentences(found, Kind.WRONG)
-
-
-def _notes_on_pictures(files: Sequence[Cube]) -> list[str]:
-    """Notes on encoding, order of colours and orientation, one sentence each; none where there is no picture."""
-    pictures = [file for file in files if file.reader == "picture"]
-    notes = []
-    if any(file.is_srgb for file in pictures):
-        notes.append("pictures are taken as sRGB and brought to linear light")
-    for centres in (file.bands.wavelengths_nm for file in pictures):
-        if centres is not None and len(centres) == 3 and centres[0] < centres[2]:
-            red, green, blue = (f"{centre:g}" for centre in centres)
-            notes.append(
-                f"the channels of pictures are red, green and blue in this order: {red} nm is taken for red, "
-                f"{green} nm for green, {blue} nm for blue. If this is wrong, give --wavelengths {blue},{green},{red}"
-            )
-            break
-    turned = sum(file.orientation != 1 for file in files)
-    if turned:
-        notes.append(
-            f"EXIF's orientation of {turned} of {len(files)} pictures is ignored, as poses and lenses refer to the "
-            "stored pixels; if yours were made from turned pictures, store these turned"
-        )
-    return notes

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from unmix_plugin.captures.calibration.references import require_comparable
+from unmix_plugin.captures.calibration.references import GivenReferences, require_comparable
 from unmix_plugin.captures.cube import (
     Capture,
     CaptureView,
@@ -40,7 +40,7 @@ from unmix_plugin.captures.posing import (
     pose_views,
 )
 from unmix_plugin.captures.readers.opening import open_spectral_file
-from unmix_plugin.captures.report import Code, Remark
+from unmix_plugin.captures.report import Code, Kind, Remark, sentences
 from unmix_plugin.captures.spoilt import UnreadableViews, judge_sharpness
 from unmix_plugin.captures.wavelengths import parse_wavelengths
 from unmix_plugin.captures.writing.resampling import Resampling
@@ -95,7 +95,7 @@ def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list
         posed = pose_views(wanted, given_poses(capture, options.poses), known)
     cameras = None if posed is None else posed.poses.cameras
     plan = make_plan(capture, wanted if posed is None else posed.views, options, references, cameras)
-    for note in plan.notes:
+    for note in sentences(plan.remarks, Kind.DONE):
         say(f"note: {note}")
     left_out |= plan.left_out
     if options.poses == MARKERS:
@@ -255,9 +255,9 @@ def _check(options: ProcessOptions) -> None:
         raise ConfigError(f"--max-noise {options.max_noise:g}: expected a share above 0")
 
 
-def _open_capture(options: ProcessOptions, references: Sequence[Cube | None]) -> Capture:
+def _open_capture(options: ProcessOptions, references: GivenReferences) -> Capture:
     wavelengths = None if options.wavelengths is None else parse_wavelengths(options.wavelengths)
-    named = tuple(path for file in references if file is not None for path in file.files)
+    named = tuple(path for file in references.files for path in file.files)
     if options.poses is not None:  # an array, perhaps
         named += (Path(options.poses), options.data / options.poses)
     asked = ReadOptions(options.dataset, wavelengths, options.axes, exclude=named)
@@ -306,14 +306,14 @@ def _by_size(capture: Capture) -> Capture:
     return replace(capture, views=tuple(views), notes=(*capture.notes, note))
 
 
-def _open_references(options: ProcessOptions) -> tuple[Cube | None, Cube | None]:
-    opened: list[Cube | None] = []
-    for path, flag in ((options.dark, "--dark"), (options.white, "--white")):
+def _open_references(options: ProcessOptions) -> GivenReferences:
+    opened: dict[str, Cube] = {}
+    for path, kind in ((options.dark, "dark"), (options.white, "white")):
         if path is not None and not path.exists():
-            raise CaptureError(f"{flag} {path}: no such file; give the image of the reference")
-        read = ReadOptions(options.dataset, None, options.axes)
-        opened.append(None if path is None else open_spectral_file(path, read))
-    return opened[0], opened[1]
+            raise CaptureError(f"--{kind} {path}: no such file; give the image of the reference")
+        if path is not None:
+            opened[kind] = open_spectral_file(path, ReadOptions(options.dataset, None, options.axes))
+    return GivenReferences(**opened)
 
 
 def _refuse_unlike(cube: Cube, first: Cube) -> None:

@@ -41,8 +41,8 @@ def _done(template: str) -> tuple[Kind, str]:
 class Code(Enum):
     """All that may be remarked, with its kind and the template of its sentence."""
 
-    FILE_NOTE = _done("{text}")
-    """Of a reader, which has no code of its own for it."""
+    NOTE = _done("{text}")
+    """Of a reader or a layout, which has no code of its own for it."""
     FILE_WARNING = _wrong("{where}: {text}")
     """Of a reader, which has no code of its own for it."""
     CAPTURE_WARNING = _wrong("{text}")
@@ -77,6 +77,46 @@ class Code(Enum):
         "no mask: files have no alpha channel and no backdrop was found that all views share, so that all of each "
         "picture is taken for the scene; right for rooms and landscapes (--mask none), otherwise give --mask white, "
         "black or files"
+    )
+
+    OPACITY_OF_SOME = _done(
+        "{count} of {views} views {has} no alpha channel ({where}), so that of the others is not used: give all "
+        "views one, or choose --mask"
+    )
+    BACKDROP_FOUND = _done(
+        "a backdrop was found that all views share, {backdrops}, and is cut out: look at contact-sheet.png; "
+        "--mask none keeps it"
+    )
+
+    # Pictures.
+    PICTURES_ARE_SRGB = _done("pictures are taken as sRGB and brought to linear light")
+    COLOURS_IN_ORDER = _done(
+        "the channels of pictures are red, green and blue in this order: {red} nm is taken for red, {green} nm for "
+        "green, {blue} nm for blue. If this is wrong, give --wavelengths {blue},{green},{red}"
+    )
+    ORIENTATION_IGNORED = _done(
+        "EXIF's orientation of {turned} of {files} pictures is ignored, as poses and lenses refer to the stored "
+        "pixels; if yours were made from turned pictures, store these turned"
+    )
+
+    # Values.
+    ONE_LOST_ABOVE = _wrong(
+        "values ({units}) were divided by {scale}, as more than {limit} are above 1{hint}: outputs of reflectance "
+        "undo it, and exported radiance times {scale} is what was measured; --scale 1 keeps values, and cuts off those "
+        "above 1"
+    )
+    ONE_LOST_BELOW = _wrong(
+        "values ({units}) were divided by {scale}, as nearly all are below {limit}{hint}: outputs of reflectance "
+        "undo it, and exported radiance times {scale} is what was measured; --scale 1 keeps values, and cuts off those "
+        "above 1"
+    )
+    BELOW_BLACK = _wrong(
+        "values lie below 0 by more than noise, and are written as 0: the dark frame is brighter than that of these "
+        "views, or was taken off their numbers before"
+    )
+    SATURATED_BELOW_ONE = _wrong(
+        "values are saturated from {end} on, and are written as 1, which is read as at least {scale}: expose less, "
+        "or make that true with --scale {end}, which cuts off all above"
     )
 
     # Exposures.

@@ -12,9 +12,15 @@ from hypothesis import strategies as st
 
 from tests.captures.file_factory import file_of
 from unmix_plugin.captures.calibration.calibration import Calibration, Raster
-from unmix_plugin.captures.calibration.references import _open_reference as open_reference
-from unmix_plugin.captures.calibration.references import _panel_reference as panel_reference
-from unmix_plugin.captures.calibration.references import find_missing, own_dark_mean
+from unmix_plugin.captures.calibration.references import (
+    ReferenceKind,
+    SensorReferences,
+    ViewReferences,
+    find_missing,
+    open_reference,
+    own_dark_mean,
+    panel_reference,
+)
 from unmix_plugin.captures.cube import Cube, Linear
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.errors import CaptureError, ConfigError
@@ -25,7 +31,9 @@ ALL = slice(None)
 ALL_BANDS = np.arange(NUM)
 
 
-def reference(stored: np.ndarray, kind: str = "white reference", cube: Cube | None = None, **facts):
+def reference(
+    stored: np.ndarray, kind: ReferenceKind = ReferenceKind.WHITE, cube: Cube | None = None, **facts
+):
     """Of a file with these numbers, for a cube that is like it."""
     file = file_of(stored, **facts)
     return open_reference(file, kind, cube or file_of(stored))
@@ -54,7 +62,7 @@ def test_lines_that_differ_by_noise_alone_are_averaged_and_images_used_pixel_by_
 def test_a_line_of_another_binning_is_interpolated_along_the_line():
     def line_of(samples: int) -> np.ndarray:
         ramp = np.tile(np.arange(samples, dtype=np.float32)[None, :, None], NUM)
-        return reference(ramp, "dark frame", EMPTY).rows(ALL, ALL, ALL_BANDS)[0, :, 0]
+        return reference(ramp, ReferenceKind.DARK, EMPTY).rows(ALL, ALL, ALL_BANDS)[0, :, 0]
 
     np.testing.assert_allclose(line_of(2 * SAMPLES), 2.0 * np.arange(SAMPLES) + 0.5)
     line = line_of(SAMPLES // 2)
@@ -93,9 +101,11 @@ def test_columns_in_which_the_white_is_not_above_the_dark_are_missing():
     counts, file = _cube()
     light = np.full((1, WIDTH, BANDS), 3000, np.uint16)
     light[0, 3, 2] = 40
-    dark = reference(np.full_like(light, 50), "dark frame", file)
+    dark = reference(np.full_like(light, 50), ReferenceKind.DARK, file)
     white = replace(reference(light, cube=file), dark=dark, reflectance=np.ones(BANDS))
-    found = Calibration(WHOLE, EVERY, dark=dark, white=white).rows(file, 0, HEIGHT)
+    found = Calibration(WHOLE, EVERY, references=SensorReferences(ViewReferences(dark, white))).rows(
+        file, 0, HEIGHT
+    )
     np.testing.assert_array_equal(found.missing, np.arange(WIDTH)[None, :] == 3 + np.zeros((HEIGHT, 1)))
     assert (found.values[:, 3] == 0).all()
     np.testing.assert_allclose(found.values[:, 4], (counts[:, 4] - 50.0) / 2950, rtol=1e-5)
@@ -112,7 +122,7 @@ def test_a_white_of_one_value_leaves_no_trace_of_the_dark_of_columns_or_pixels(i
     truth = generator.choice([0.25, 0.5], (LINES, SAMPLES, 1)) + np.zeros(NUM)
     truth[2:8, 3:9] = 1.0
     cube = file_of((8000 * truth + dark_levels).astype(np.uint16))
-    dark = reference(np.broadcast_to(dark_levels, truth.shape).astype(np.uint16), "dark frame", cube)
+    dark = reference(np.broadcast_to(dark_levels, truth.shape).astype(np.uint16), ReferenceKind.DARK, cube)
     assert dark.is_per_pixel == is_image
     if is_in_view:
         white = panel_reference(cube, (2, 3, 6, 6), "a view")
@@ -121,7 +131,11 @@ def test_a_white_of_one_value_leaves_no_trace_of_the_dark_of_columns_or_pixels(i
         white = reference(level.astype(np.float32), cube=cube)
     white = replace(white, dark=dark, reflectance=np.ones(NUM))
     np.testing.assert_allclose(white.signal, 8000, rtol=1e-6)
-    calibration = Calibration(Raster.of(LINES, SAMPLES, None, 1), ALL_BANDS, dark=dark, white=white)
+    calibration = Calibration(
+        Raster.of(LINES, SAMPLES, None, 1),
+        ALL_BANDS,
+        references=SensorReferences(ViewReferences(dark, white)),
+    )
     np.testing.assert_allclose(calibration.rows(cube, 0, LINES).values, truth, rtol=1e-5)
 
 
@@ -129,11 +143,11 @@ def test_a_reference_has_gains_where_the_cubes_have_them():
     stored = np.full((4, 3, 2), 100, np.uint16)
     gains, offsets = np.array([0.5, 2.0]), np.array([1.0, -1.0])
     cube = file_of(stored, linear=Linear(gains, offsets, "its header"))
-    found = open_reference(cube, "white reference", cube)
+    found = open_reference(cube, ReferenceKind.WHITE, cube)
     np.testing.assert_allclose(found.mean[0, 0], stored[0, 0] * gains + offsets)
     for pair in ((cube, file_of(stored)), (file_of(stored), cube)):
         with pytest.raises(CaptureError, match=r"no gains or scale.*its header"):
-            open_reference(pair[0], "white reference", pair[1])
+            open_reference(pair[0], ReferenceKind.WHITE, pair[1])
 
 
 @given(st.integers(0, 5), st.integers(0, 5), st.integers(1, 3), st.floats(5.0, 500.0), st.floats(-20.0, 40.0))
@@ -161,7 +175,9 @@ def test_pixels_of_a_reference_without_a_measurement_are_left_out_of_it(is_image
     counts = np.random.default_rng(0).integers(100, 4000, light.shape).astype(np.uint16)
     known = replace(white, reflectance=np.ones(NUM))
     raster = Raster.of(LINES, SAMPLES, None, 1)
-    found = Calibration(raster, ALL_BANDS, white=known).rows(file_of(counts), 0, LINES)
+    found = Calibration(raster, ALL_BANDS, references=SensorReferences(ViewReferences(white=known))).rows(
+        file_of(counts), 0, LINES
+    )
     measured = ~found.missing
     assert measured[4:].all()
     assert (~measured[:4, 5]).all() == is_image
@@ -174,7 +190,7 @@ def test_pixels_of_a_reference_without_a_measurement_are_left_out_of_it(is_image
 def test_a_dark_frame_of_zeros_is_measured_where_zero_means_no_data_too():
     counts = np.random.default_rng(0).integers(0, 2, (LINES, SAMPLES, NUM)).astype(np.uint16)
     counts[:, :3] = 0
-    dark = reference(counts, "dark frame", no_data=(0.0,))
+    dark = reference(counts, ReferenceKind.DARK, no_data=(0.0,))
     np.testing.assert_allclose(dark.mean[0], counts.mean(axis=0), rtol=1e-6)
     with pytest.raises(CaptureError, match="has columns without a measurement"):
         reference(counts, no_data=(0.0,))

@@ -9,23 +9,28 @@ import pytest
 
 from tests.captures.file_factory import exposure_of_file, file_of
 from tests.captures.test_camera_tags import EXIF, MICASENSE
-from unmix_plugin.captures.calibration.references import _open_reference as open_reference
-from unmix_plugin.captures.calibration.references import _panel_reference as panel_reference
-from unmix_plugin.captures.calibration.sensor import (
-    _BandChoice,
-    _clipped_bands,
-    _drop_found,
-    _find_saturation,
-    _noise_shares,
-    prepare_sensor,
-    sampled_rows,
+from unmix_plugin.captures.calibration.bands import (
+    BandChoice,
+    BandFault,
+    DroppedBand,
+    noise_shares,
+    without_bad,
+)
+from unmix_plugin.captures.calibration.references import (
+    GivenReferences,
+    ReferenceKind,
+    open_reference,
+    panel_reference,
 )
 from unmix_plugin.captures.cube import CameraTags, CaptureView, Linear
+from unmix_plugin.captures.decide import find_saturation, saturated_bands
 from unmix_plugin.captures.options import ProcessOptions
-from unmix_plugin.captures.plan import _with_one_exposure as with_one_exposure
+from unmix_plugin.captures.plan import plan_sensor, with_one_exposure
 from unmix_plugin.captures.report import Code
+from unmix_plugin.captures.sample import WhiteSample, count_stored, sampled_rows
 
 WAVELENGTHS_NM = np.linspace(400.0, 900.0, 12)
+NAMED = DroppedBand(BandFault.NAMED)
 GENERATOR = np.random.default_rng(0)
 SPECTRA = GENERATOR.random((3, 12)) * 0.6 + 0.2
 MIXTURES = (GENERATOR.dirichlet(np.ones(3), 3000) @ SPECTRA).astype(np.float32)
@@ -36,11 +41,11 @@ def test_noise_is_found_beside_what_bands_share_and_not_told_from_too_few_pixels
     level[7] = 0.3
     noisy = MIXTURES + level * np.random.default_rng(5).standard_normal(MIXTURES.shape)
     expected = level / np.sqrt((noisy**2).mean(axis=0))
-    found = _noise_shares(noisy.astype(np.float32))
+    found = noise_shares(noisy.astype(np.float32))
     assert found[7] == pytest.approx(expected[7], rel=0.05)
     np.testing.assert_allclose(np.delete(found, 7), np.delete(expected, 7), rtol=0.5)
-    assert np.isnan(_noise_shares(MIXTURES[:20])).all()
-    assert np.isnan(_noise_shares(MIXTURES[:, :3])).all()
+    assert np.isnan(noise_shares(MIXTURES[:20])).all()
+    assert np.isnan(noise_shares(MIXTURES[:, :3])).all()
 
 
 def test_dead_saturated_and_noisy_bands_are_left_out_with_the_reason():
@@ -49,34 +54,36 @@ def test_dead_saturated_and_noisy_bands_are_left_out_with_the_reason():
     values[:, 7] += 3.0 * GENERATOR.standard_normal(len(values)).astype(np.float32)
     saturated = np.zeros(values.shape, bool)
     saturated[: len(values) // 3, 9] = True
-    choice = _BandChoice(WAVELENGTHS_NM, {0: "named"})
-    found = _drop_found(choice, (values[:, 1:], saturated[:, 1:]), 0.5, [])
-    assert {band: reason.split(":")[0].split(" is ")[0] for band, reason in found.dropped.items()} == {
-        0: "named",
-        2: "dead",
-        7: "noise",
-        9: "saturated in more than 20% of sampled pixels",
+    choice = BandChoice(WAVELENGTHS_NM, dropped={0: NAMED})
+    found, _ = without_bad(choice, values[:, 1:], saturated[:, 1:], 0.5)
+    assert {index: band.fault for index, band in found.dropped.items()} == {
+        0: BandFault.NAMED,
+        2: BandFault.DEAD,
+        7: BandFault.NOISY,
+        9: BandFault.SATURATED,
     }
+    assert found.dropped[9].reason == "saturated in more than 20% of sampled pixels"
+    assert found.dropped[7].reason.startswith("noise is ")
     np.testing.assert_array_equal(found.kept, [1, 3, 4, 5, 6, 8, 10, 11])
 
 
 def test_what_is_wrong_with_every_band_drops_none():
     """A white background that saturates them, or nothing that they have in common."""
-    choice, notes = _BandChoice(WAVELENGTHS_NM, {}), []
+    choice = BandChoice(WAVELENGTHS_NM)
     saturated = np.zeros(MIXTURES.shape, bool)
     saturated[:2000] = True
-    assert _drop_found(choice, (MIXTURES, saturated), 0.5, notes).dropped == {}
-    assert notes == []
+    assert without_bad(choice, MIXTURES, saturated, 0.5) == (choice, [])
     independent = GENERATOR.random((3000, 12)).astype(np.float32)
-    assert _drop_found(choice, (independent, np.zeros_like(saturated)), 0.3, notes).dropped == {}
-    assert [(note.code, note.values["noisy"]) for note in notes] == [(Code.NOISY_BANDS_KEPT, 12)]
+    kept, remarks = without_bad(choice, independent, np.zeros_like(saturated), 0.3)
+    assert kept.dropped == {}
+    assert [(remark.code, remark.values["noisy"]) for remark in remarks] == [(Code.NOISY_BANDS_KEPT, 12)]
 
 
 def test_bands_are_sorted_and_binned_by_wavelength_and_used_once():
-    choice = _BandChoice(np.array([700.0, 500.0, 600.0, 800.0, 550.0]), {3: "named"})
+    choice = BandChoice(np.array([700.0, 500.0, 600.0, 800.0, 550.0]), dropped={3: NAMED})
     np.testing.assert_array_equal(choice.kept, [1, 4, 2, 0])
     np.testing.assert_allclose(choice.centers_nm(2), [525.0, 650.0])
-    assert list(_BandChoice(np.array([500.0, 510.0, 500.0]), {}).without_repeated().dropped) == [2]
+    assert list(BandChoice(np.array([500.0, 510.0, 500.0])).without_repeated().dropped) == [2]
 
 
 @pytest.mark.parametrize(
@@ -96,10 +103,14 @@ def test_bands_are_sorted_and_binned_by_wavelength_and_used_once():
     ],
 )
 def test_no_bin_spans_a_gap(wavelengths_nm, dropped, expected):
-    named = _BandChoice(np.array(wavelengths_nm, float), dict.fromkeys(dropped, "named"))
+    named = BandChoice(np.array(wavelengths_nm, float), dropped=dict.fromkeys(dropped, NAMED))
     choice = named.without_incomplete_bins(2)
     np.testing.assert_allclose(choice.centers_nm(2), expected)
-    assert set(choice.dropped.values()) <= {"named", "too few up to a gap or the end for --bin-bands 2"}
+    assert {band.fault for band in choice.dropped.values()} <= {BandFault.NAMED, BandFault.BIN_INCOMPLETE}
+
+
+def saturation_of(file):
+    return find_saturation(count_stored([file], np.arange(6)))
 
 
 @pytest.mark.parametrize(
@@ -115,38 +126,37 @@ def test_no_bin_spans_a_gap(wavelengths_nm, dropped, expected):
 def test_the_end_of_the_detector_is_a_plateau(top: int, facts, part, value: int, expected: float):
     counts = GENERATOR.normal(2000, 900, (64, 64, 6)).clip(0, top).astype(np.uint16)
     counts[part] = value
-    assert _find_saturation([file_of(counts, **facts)], np.arange(6))[0] == expected
+    assert saturation_of(file_of(counts, **facts)).stored == expected
 
 
 @pytest.mark.parametrize(("factor", "expected"), [(1.0, 4095.0), (1e-4, None), (-1.0, None)])
 @pytest.mark.parametrize("dtype", [np.float32, np.int32])
 def test_counts_end_where_the_detector_does_in_wider_numbers_too(dtype, factor: float, expected):
     counts = GENERATOR.normal(2000, 900, (64, 64, 6)).clip(0, 4095).round()
-    found = _find_saturation([file_of((counts * factor).astype(dtype))], np.arange(6))[0]
-    assert found == expected
+    assert saturation_of(file_of((counts * factor).astype(dtype))).stored == expected
 
 
 def test_a_rim_without_a_measurement_hides_no_saturation():
     counts = GENERATOR.normal(2000, 900, (64, 64, 6)).clip(0, 4095).round().astype(np.float32)
     counts[:, :5], counts[:, -5:], counts[:2], counts[-2:] = (np.nan,) * 4
-    assert _find_saturation([file_of(counts)], np.arange(6))[0] == 4095.0
-    found, why = _find_saturation([file_of(np.full_like(counts, np.nan))], np.arange(6))
-    assert found is None
-    assert "no sampled pixel has a measurement" in why
+    assert saturation_of(file_of(counts)).stored == 4095.0
+    found = saturation_of(file_of(np.full_like(counts, np.nan)))
+    assert found.stored is None
+    assert "no sampled pixel has a measurement" in found.evidence
 
 
 def white_of(counts: np.ndarray, **facts):
-    return open_reference(file_of(counts, **facts), "white reference", file_of(counts, **facts))
+    return open_reference(file_of(counts, **facts), ReferenceKind.WHITE, file_of(counts, **facts))
 
 
 def test_missing_pixels_of_a_white_do_not_count_as_saturated():
     counts = GENERATOR.integers(2900, 3100, (16, 8, 3)).astype(np.uint16)
     counts[1:4, :, 2] = 4095
     counts[::8] = 65535
-    found = _clipped_bands(white_of(counts, no_data=(65535.0,)), 65535.0)
+    found = saturated_bands(WhiteSample.of(white_of(counts, no_data=(65535.0,))), 65535.0)
     np.testing.assert_array_equal(found, [False, False, True])
     counts[sampled_rows(16)] = 65535  # nothing is left to look at
-    assert not _clipped_bands(white_of(counts, no_data=(65535.0,)), 65535.0).any()
+    assert not saturated_bands(WhiteSample.of(white_of(counts, no_data=(65535.0,))), 65535.0).any()
 
 
 BLOWN = np.array([False, True, False])
@@ -171,7 +181,7 @@ def test_a_blown_out_white_is_told_by_its_stored_numbers(facts, top, dtype, satu
     view[7:47, 9:29] = counts
     panel = panel_reference(file_of(view, **facts), (7, 9, 40, 20), "a view")
     for white in (white_of(counts, **facts), panel):
-        np.testing.assert_array_equal(_clipped_bands(white, saturation), BLOWN)
+        np.testing.assert_array_equal(saturated_bands(WhiteSample.of(white), saturation), BLOWN)
 
 
 def together(cubes: dict[str, np.ndarray], facts: dict[str, dict]):
@@ -180,7 +190,7 @@ def together(cubes: dict[str, np.ndarray], facts: dict[str, dict]):
     files = {name: file_of(cube, bands, **facts[name]) for name, cube in cubes.items()}
     options = ProcessOptions("cubes", data=Path(), output_dir=Path())
     each = {name: [CaptureView(name, file, name)] for name, file in files.items()}
-    sensors = {name: prepare_sensor(own, options, (None, None), own) for name, own in each.items()}
+    sensors = {name: plan_sensor(own, options, GivenReferences(), own) for name, own in each.items()}
     return with_one_exposure(sensors, files).values()
 
 

@@ -10,17 +10,15 @@ bands of the result. Of exposures, `b` is 1, or the bands of a file.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
-from pathlib import Path
+from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 
 from unmix_plugin.captures.calibration.exposures import exposure_of
 from unmix_plugin.captures.calibration.references import (
-    Reference,
-    References,
+    SensorReferences,
     find_missing,
     refuse_outside,
     stated_values,
@@ -122,15 +120,12 @@ class Calibration:
     """Indices of the kept bands in the file, in the order of the result."""
     bin_bands: int = 1
     """Neighbouring kept bands that become one, of which there are whole multiples."""
-    dark: Reference | None = None
-    white: Reference | None = None
+    references: SensorReferences = SensorReferences()
     saturation: float | None = None
     """Stored number of a saturated pixel; None where none is known."""
     exposure: Float64[np.ndarray, " b"] | None = None
     """Exposure (see `exposure_of`) that values are brought to, one number or one a band of the file: that of the white
     reference, otherwise of the first view; None where exposures are not compared."""
-    own: Mapping[Path, References] = field(default_factory=dict)
-    """Dark and white of single views, by the path of their cube; they go before the common ones."""
 
     @property
     def num_bands(self) -> int:
@@ -179,11 +174,12 @@ class Calibration:
     def _values(self, file: Cube, whole: np.ndarray, rows: slice) -> Float32[np.ndarray, "h W b"]:
         columns, bands = self.raster.columns, self.bands
         values = stated_values(file, whole, rows, bands)[:, columns]  # a new array, free to be changed
-        dark, white = self.own.get(file.path, (self.dark, self.white))
+        used = self.references.of(file)
+        dark, white = used.dark, used.white
         if dark is not None:
             values -= dark.rows(rows, columns, bands)
         factor, wanted, found = np.ones(1, np.float32), self.exposure, exposure_of(file)
-        if file.path in self.own and white is not None and wanted is not None:
+        if file.path in self.references.own and white is not None and wanted is not None:
             wanted = exposure_of(white.file)  # its own white reference
         if wanted is not None and found is not None:
             ratio = (wanted / found).astype(np.float32)

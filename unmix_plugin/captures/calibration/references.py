@@ -5,11 +5,11 @@ Notation: `H x W` pixels and `B` bands of a file, of which `h` rows and `b` band
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from enum import Enum
 from functools import cached_property
 from pathlib import Path
-from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Float32, Float64
@@ -112,6 +112,18 @@ def _measured(file: Cube, rows: slice, bands: BandIndex = slice(None)) -> Float3
     return values
 
 
+class ReferenceKind(Enum):
+    """What is measured beside the views."""
+
+    DARK = "dark frame"
+    WHITE = "white reference"
+
+    @property
+    def flag(self) -> str:
+        """Names one for all views."""
+        return f"--{self.name.lower()}"
+
+
 @dataclass(frozen=True)
 class Reference:
     """A measured reference, brought to the columns of the cubes."""
@@ -156,7 +168,7 @@ class Reference:
         return own - np.nanmean(behind, axis=(0, 1), dtype=np.float64)
 
 
-def _open_reference(file: Cube, what: str, cube: Cube) -> Reference:
+def open_reference(file: Cube, kind: ReferenceKind, cube: Cube) -> Reference:
     """A reference for the cubes of one sensor.
 
     A file with as many rows and columns as the cubes is used pixel by pixel if its rows differ by more than noise (a
@@ -164,18 +176,19 @@ def _open_reference(file: Cube, what: str, cube: Cube) -> Reference:
     measurement are left out of it, where 0 in a dark frame is one whatever its header says. Raises CaptureError: other
     bands than the cubes, other units, or a column without a measurement.
     """
-    if what == "dark frame":  # software writes one no-data value into all headers of a capture
+    if kind is ReferenceKind.DARK:  # software writes one no-data value into all headers of a capture
         file = replace(file, no_data=tuple(number for number in file.no_data if number != 0))
     height, width, bands = file.shape
     if bands != cube.shape[2]:
         raise CaptureError(
-            f"{file.path}: the {what} has {bands} bands, the cubes have {cube.shape[2]} ({cube.path}); expected as many"
+            f"{file.path}: the {kind.value} has {bands} bands, the cubes have {cube.shape[2]} ({cube.path}); expected "
+            "as many"
         )
     require_comparable(file, cube)
     mean, pattern = _column_means(file)
     if not np.isfinite(mean).all():
         raise CaptureError(
-            f"{file.path}: the {what} has columns without a measurement (NaN, infinite or no-data); take it again"
+            f"{file.path}: the {kind.value} has columns without a measurement (NaN, infinite or no-data); take it again"
         )
     if (height, width) == cube.shape[:2] and height > 1 and pattern > _MOST_PATTERN:
         how = f"pixel by pixel, as its rows differ ({pattern:.1f} times what noise explains)"
@@ -194,14 +207,14 @@ def _open_reference(file: Cube, what: str, cube: Cube) -> Reference:
 
 def _open_white(file: Cube, own_dark: Cube | None, cube: Cube) -> Reference:
     """A white reference with the dark frame that was taken for it alone, if there is one."""
-    white = _open_reference(file, "white reference", cube)
+    white = open_reference(file, ReferenceKind.WHITE, cube)
     if own_dark is None:
         return white
-    dark = _open_reference(own_dark, "dark frame", cube)
+    dark = open_reference(own_dark, ReferenceKind.DARK, cube)
     return replace(white, dark=dark, how=f"{white.how}; less a dark frame of its own ({dark.how})")
 
 
-def _panel_reference(cube: Cube, rectangle: tuple[int, int, int, int], view: str) -> Reference:
+def panel_reference(cube: Cube, rectangle: tuple[int, int, int, int], view: str) -> Reference:
     """The mean of a rectangle of a view as the white reference of all.
 
     Args:
@@ -310,57 +323,119 @@ def _as_white(
     return replace(white, reflectance=values)
 
 
-References: TypeAlias = tuple[Reference | None, Reference | None]
-"""Dark frame and white reference."""
+@dataclass(frozen=True)
+class GivenReferences:
+    """References that the user names; they go before those of views."""
+
+    dark: Cube | None = None
+    white: Cube | None = None
+
+    @property
+    def files(self) -> list[Cube]:
+        """Those that there are."""
+        return [file for file in (self.dark, self.white) if file is not None]
+
+
+@dataclass(frozen=True)
+class ViewReferences:
+    """What the numbers of a view are compared with."""
+
+    dark: Reference | None = None
+    white: Reference | None = None
+
+
+@dataclass(frozen=True)
+class SensorReferences:
+    """References of all views of a sensor."""
+
+    common: ViewReferences = ViewReferences()
+    own: Mapping[Path, ViewReferences] = field(default_factory=dict)
+    """Of views that were taken with their own, by the path of their cube; they go before the common ones."""
+
+    def of(self, file: Cube) -> ViewReferences:
+        """Those of the view with this cube."""
+        return self.own.get(file.path, self.common)
+
+    @property
+    def whites(self) -> list[Reference]:
+        """All white references, one a view where views have their own."""
+        used = [*self.own.values()] or [self.common]
+        return [references.white for references in used if references.white is not None]
+
+    def darks_beside(self, files: Sequence[Cube]) -> list[tuple[Cube, Cube]]:
+        """Each dark frame with the file that it is subtracted from: a view's, or that of a white reference."""
+        pairs = []
+        for file in files:
+            used = self.of(file)
+            pairs += [(used.dark.file, file)] if used.dark else []
+            pairs += [(used.white.dark.file, used.white.file)] if used.white and used.white.dark else []
+        return pairs
 
 
 def find_references(
     views: Sequence[CaptureView],
     wavelengths_nm: Float64[np.ndarray, " B"],
     options: ProcessOptions,
-    files: tuple[Cube | None, Cube | None],
+    given: GivenReferences,
     all_views: Sequence[CaptureView],
-) -> tuple[References, dict[Path, References]]:
-    """References of all views of a sensor, and those of views that were taken with their own, by cube.
+) -> SensorReferences:
+    """References of the views of a sensor.
 
     Args:
         wavelengths_nm: Of all bands of the files.
-        files: Dark frame and white reference that the user names; they go before those of views.
         all_views: With those that have no pose: one may show a panel.
     Raises:
         CaptureError: a reference does not fit the views, or some have one of their own and others have none.
         ConfigError: the rectangle of the panel, or its reflectance, is wrong.
     """
-    cube, (dark_file, white_file) = views[0].cube, files
-    dark = None if dark_file is None else _open_reference(dark_file, "dark frame", cube)
+    cube = views[0].cube
+    dark = None if given.dark is None else open_reference(given.dark, ReferenceKind.DARK, cube)
     panel = None
     if options.white_rectangle is not None:
         panel = _panel_in_view(all_views, *options.white_rectangle, is_dark_given=dark is not None)
-    elif white_file is not None:
-        panel = _open_white(white_file, _own_dark(white_file) if dark is None else None, cube)
+    elif given.white is not None:
+        panel = _open_white(given.white, _own_dark(given.white) if dark is None else None, cube)
     white = panel and _as_white(panel, dark, options.white_reflectance, wavelengths_nm)
-    own: dict[Path, References] = {}
-    # That of the user goes before all.
-    own_whites = [(view.white, view.white_dark) for view in views if view.white is not None and dark is None]
-    of_whites = {one.path: found for one, beside in own_whites if (found := _own_dark(one, beside))}
-    darks = _each_view(
-        [_own_dark(view.cube, view.dark) for view in views], views, "dark frame", dark is not None
-    )
-    whites = _each_view([view.white for view in views], views, "white reference", white is not None)
-    seen: dict[tuple[Path | None, Path | None], References] = {}  # files that several views share
-    for view, own_dark, own_white in zip(views, darks, whites, strict=True):
-        if own_dark is None and own_white is None:
+    common = ViewReferences(dark, white)
+    return SensorReferences(common, _own_references(views, wavelengths_nm, options, common))
+
+
+def _own_references(
+    views: Sequence[CaptureView],
+    wavelengths_nm: Float64[np.ndarray, " B"],
+    options: ProcessOptions,
+    common: ViewReferences,
+) -> dict[Path, ViewReferences]:
+    """References of views that were taken with their own, by the path of their cube, with the common one of what they
+    lack."""
+    darks, whites, darks_of_whites = {}, {}, {}
+    if common.dark is None:
+        darks = _one_each({view.name: _own_dark(view.cube, view.dark) for view in views}, ReferenceKind.DARK)
+        darks_of_whites = {
+            view.white.path: _own_dark(view.white, view.white_dark)
+            for view in views
+            if view.white is not None
+        }
+    if common.white is None:
+        whites = _one_each({view.name: view.white for view in views}, ReferenceKind.WHITE)
+    opened: dict[tuple[Path | None, Path | None], ViewReferences] = {}  # files that several views share
+    own: dict[Path, ViewReferences] = {}
+    for view in views:
+        dark_file, white_file = darks.get(view.name), whites.get(view.name)
+        if dark_file is None and white_file is None:
             continue
-        key = (own_dark and own_dark.path, own_white and own_white.path)
-        if key not in seen:
-            its_dark = dark if own_dark is None else _open_reference(own_dark, "dark frame", view.cube)
-            its_white = white and replace(white, dark=white.dark or its_dark)
-            if own_white is not None:
-                panel = _open_white(own_white, of_whites.get(own_white.path), view.cube)
-                its_white = _as_white(panel, its_dark, options.white_reflectance, wavelengths_nm)
-            seen[key] = its_dark, its_white
-        own[view.cube.path] = seen[key]
-    return (dark, white), own
+        key = (dark_file and dark_file.path, white_file and white_file.path)
+        if key not in opened:
+            dark = common.dark
+            if dark_file is not None:
+                dark = open_reference(dark_file, ReferenceKind.DARK, view.cube)
+            white = common.white and replace(common.white, dark=common.white.dark or dark)
+            if white_file is not None:
+                panel = _open_white(white_file, darks_of_whites.get(white_file.path), view.cube)
+                white = _as_white(panel, dark, options.white_reflectance, wavelengths_nm)
+            opened[key] = ViewReferences(dark, white)
+        own[view.cube.path] = opened[key]
+    return own
 
 
 def _panel_in_view(
@@ -378,9 +453,9 @@ def _panel_in_view(
     if view is None:
         names = name_some([view.name for view in views], 5)
         raise ConfigError(f"--white-rectangle {wanted}: no view of this name; there are {names}")
-    panel = _panel_reference(view.cube, (top, left, height, width), view.name)
+    panel = panel_reference(view.cube, (top, left, height, width), view.name)
     dark = None if is_dark_given else _own_dark(view.cube, view.dark)
-    return panel if dark is None else replace(panel, dark=_open_reference(dark, "dark frame", view.cube))
+    return panel if dark is None else replace(panel, dark=open_reference(dark, ReferenceKind.DARK, view.cube))
 
 
 def _own_dark(file: Cube, beside: Cube | None = None) -> Cube | None:
@@ -393,21 +468,17 @@ def own_dark_mean(file: Cube) -> Float32[np.ndarray, "1 W B"] | None:
     """Mean of the lines of a file that were taken with the shutter closed; None where it has none or its numbers are
     not raw. Raises CaptureError: a column of them holds no measurement."""
     dark = _own_dark(file)
-    return None if dark is None else _open_reference(dark, "dark frame", file).mean
+    return None if dark is None else open_reference(dark, ReferenceKind.DARK, file).mean
 
 
-def _each_view(
-    files: Sequence[Cube | None], views: Sequence[CaptureView], what: str, is_given: bool
-) -> Sequence[Cube | None]:
-    """A reference for each view: its own, or the only one that there is; none where the user gives one for all."""
-    known = {file.path: file for file in files if file is not None}
-    missing = [view.name for view, file in zip(views, files, strict=True) if file is None]
-    if is_given or not known:
-        return [None] * len(files)
+def _one_each(files: Mapping[str, Cube | None], kind: ReferenceKind) -> dict[str, Cube]:
+    """A reference for each view, by its name: its own, or the only one that there is. Raises CaptureError: several
+    views have different ones, and others none."""
+    known = {file.path: file for file in files.values() if file is not None}
+    missing = [name for name, file in files.items() if file is None]
     if missing and len(known) > 1:
         raise CaptureError(
-            f"{counted(len(missing), 'view')} ({name_some(missing)}) without a {what} of their own, {len(known)} "
-            f"others have one; expected one for each, or one for all (--{what.split()[0]})"
+            f"{counted(len(missing), 'view')} ({name_some(missing)}) without a {kind.value} of their own, {len(known)} "
+            f"others have one; expected one for each, or one for all ({kind.flag})"
         )
-    only = next(iter(known.values()))
-    return [only if file is None else file for file in files]
+    return {name: file or only for name, file in files.items() for only in list(known.values())[:1]}

@@ -17,12 +17,12 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 
 from unmix_plugin import __version__
-from unmix_plugin.captures.calibration.sensor import Sensor
+from unmix_plugin.captures.calibration.bands import BandFault
 from unmix_plugin.captures.checks import SeenView, angles_between, check_views
 from unmix_plugin.captures.cube import CaptureView
 from unmix_plugin.captures.match_checks import MatchedScene, check_matches
 from unmix_plugin.captures.options import ProcessOptions, plain_options
-from unmix_plugin.captures.plan import Plan, hashes
+from unmix_plugin.captures.plan import Plan, SensorPlan, hashes
 from unmix_plugin.captures.poses.pose_set import PoseSet
 from unmix_plugin.captures.posing import PosedViews
 from unmix_plugin.captures.report import Kind, Remark, report_text, sentences
@@ -103,7 +103,7 @@ def write_scene_files(
     greatest = _greatest_sensor(seen)
     alike = {name for name, sensor in plan.sensors.items() if _has_bands_of(sensor, plan.sensors[greatest])}
     findings = sentences(left_out, Kind.WRONG)
-    findings += dict.fromkeys((*plan.warnings, *posed.poses.warnings))
+    findings += dict.fromkeys((*sentences(plan.remarks, Kind.WRONG), *posed.poses.warnings))
     measured = check_views([v for v in seen if v.record.sensor in alike], posed.poses.points, findings)
     findings += posed.findings
     check_files(posed.views, options, findings)
@@ -127,9 +127,9 @@ def write_scene_files(
         "options": plain_options(options),
         "decisions": plan.decisions,
         "decided": [decision.to_json() for decision in decided],
-        "stored": {"type": "uint16", "value_scale": FULL_SCALE, "calibrated_value_of_1": plan.scale},
+        "stored": {"type": "uint16", "value_scale": FULL_SCALE, "calibrated_value_of_1": plan.scale.value},
         "poses": {"source": posed.poses.source, "notes": list(posed.notes), **posed.keys},
-        "notes": list(plan.notes),
+        "notes": sentences(plan.remarks, Kind.DONE),
         "what_looks_wrong": findings,
         "left_out": [remark.to_json() for remark in left_out],
         "measured": measured,
@@ -175,18 +175,19 @@ def _write_light(folder: Path, plan: Plan) -> dict[str, Any]:
     """
     first, *others = sensors = list(plan.sensors.values())
     # Where nobody says what 1 is, values that had to be divided may be per cent, or anything.
-    if not all(sensor.is_reflectance and (sensor.is_stated or plan.scale == 1.0) for sensor in sensors):
+    meanings = [sensor.meaning for sensor in sensors]
+    if not all(one.is_reflectance and (one.states_one or plan.scale.value == 1.0) for one in meanings):
         return {}
     if first.lamp is not None and all(_has_bands_of(first, other) for other in others):
         lamp = SpectraTable(Bands(first.centers_nm), ("power",), first.lamp[None])
         write_spectra_csv(folder / _ILLUMINANT_NAME, lamp)
     bands = Bands(np.unique(np.concatenate([sensor.centers_nm for sensor in sensors])))
     write_spectra_csv(folder / _FLAT_LIGHT_NAME, SpectraTable(bands, ("power",), np.ones((1, len(bands)))))
-    divided = {} if plan.scale == 1.0 else {"reflectance_of_1": plan.scale}
+    divided = {} if plan.scale.value == 1.0 else {"reflectance_of_1": plan.scale.value}
     return {"illuminant_path": _FLAT_LIGHT_NAME, **divided}
 
 
-def _has_bands_of(sensor: Sensor, other: Sensor) -> bool:
+def _has_bands_of(sensor: SensorPlan, other: SensorPlan) -> bool:
     """Whether views of two sensors can be compared."""
     return np.array_equal(sensor.centers_nm, other.centers_nm)
 
@@ -224,7 +225,7 @@ def _transforms_json(
         "wavelengths": bands.tolist(),
         **_widths(plan, views, bands),
         "value_scale": FULL_SCALE,
-        "calibrated_value_of_1": plan.scale,
+        "calibrated_value_of_1": plan.scale.value,
         **extra,
         **splits,
         "frames": frames,
@@ -275,16 +276,17 @@ def _what_was_done(plan: Plan, posed: PosedViews, views: Sequence[ViewRecord]) -
     """Decisions and totals, one sentence each."""
     lines = []
     for name, sensor in plan.sensors.items():
-        where, facts = f"{name}: " if name else "", sensor.evidence
-        lines.append(f"{where}values are {sensor.unit}; wavelengths from {facts['wavelengths']}")
+        where, used = f"{name}: " if name else "", sensor.references_used
+        lines.append(
+            f"{where}values are {sensor.meaning.description}; wavelengths from {sensor.bands.source}"
+        )
         for key, what in (("dark", "dark frame"), ("white", "white reference")):
-            lines += [f"{where}{what}: {facts[key]['use']}"] if key in facts else []
-        stored, evidence = facts["saturation"]["stored"], facts["saturation"]["evidence"]
+            lines += [f"{where}{what}: {used[key]['use']}"] if key in used else []
+        stored, evidence = sensor.saturation.stored, sensor.saturation.evidence
         lines.append(f"{where}saturation: {evidence if stored is None else f'from {stored:g} ({evidence})'}")
         lines += [f"{where}bands left out: {bands} ({reason})" for reason, bands in _left_out(sensor).items()]
-    scale = plan.decisions["scale"]
     lines.append(
-        f"{scale['calibrated']:g} is written as 1: {scale['evidence']}; full scale of the cubes is {FULL_SCALE}"
+        f"{plan.scale.value:g} is written as 1: {plan.scale.evidence}; full scale of the cubes is {FULL_SCALE}"
     )
 
     def total(what: str) -> str:
@@ -315,15 +317,15 @@ def _what_was_done(plan: Plan, posed: PosedViews, views: Sequence[ViewRecord]) -
         rules = [r.background for r in plan.recipes.values() if isinstance(r.background, BackgroundRule)]
         levels = ", ".join(f"{rule.level:.3f} (threshold {rule.threshold:.3f})" for rule in rules)
         lines.append(f"{plan.mask} background at {levels}; {share}; {changed}")
-    return [*lines, *posed.notes, *plan.notes]
+    return [*lines, *posed.notes, *sentences(plan.remarks, Kind.DONE)]
 
 
-def _left_out(sensor: Sensor) -> dict[str, str]:
+def _left_out(sensor: SensorPlan) -> dict[str, str]:
     """Wavelengths of the bands that were left out, by reason; the first few of many."""
     found: dict[str, list[str]] = defaultdict(list)
-    for band, reason in sorted(sensor.bands.dropped.items()):
-        wavelength = f"{sensor.bands.wavelengths_nm[band]:g} nm"
-        found["noisy" if reason.startswith("noise") else reason].append(wavelength)
+    for index, band in sorted(sensor.bands.dropped.items()):
+        reason = "noisy" if band.fault is BandFault.NOISY else band.reason
+        found[reason].append(f"{sensor.bands.wavelengths_nm[index]:g} nm")
     return {reason: name_some(names, _MOST_BANDS) for reason, names in found.items()}
 
 
@@ -345,7 +347,7 @@ _MOST_POINTS = 6000
 
 def _contact_sheet(
     views: Sequence[SeenView],
-    sensors: Mapping[str, Sensor],
+    sensors: Mapping[str, SensorPlan],
     poses: PoseSet,
     heading: str,
     left_out: Sequence[ViewRecord] = (),
@@ -446,7 +448,7 @@ def _draw_cameras(
     plain_axes(axes)
 
 
-def _draw_spectra(axes: Any, views: Sequence[SeenView], sensors: Mapping[str, Sensor]) -> None:
+def _draw_spectra(axes: Any, views: Sequence[SeenView], sensors: Mapping[str, SensorPlan]) -> None:
     """Mean spectra of views as thin lines, their mean as a thick one, bands that were left out as ticks above."""
     from matplotlib import colormaps
 
