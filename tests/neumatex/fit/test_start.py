@@ -14,7 +14,7 @@ from tests.products.ball_model import RADIUS, ball_scene
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.neumatex.fit import data_manager
 from unmix_plugin.neumatex.fit.data_manager import _view_arrays
-from unmix_plugin.neumatex.fit.model import _distance
+from unmix_plugin.neumatex.fit.model import prior_distance
 from unmix_plugin.neumatex.fit.object_scene import load_object
 from unmix_plugin.neumatex.fit.start import _RunMaterials, start_plain, views_of
 from unmix_plugin.neumatex.tracing.families import PbrFamily
@@ -23,17 +23,17 @@ from unmix_plugin.neumatex.tracing.surface import Triplane, TriplaneSurface
 from unmix_plugin.spectral.bands import Bands
 
 
-def test_the_distance_counts_each_parameter_by_its_expected_error():
+def test_theprior_distance_counts_each_parameter_by_its_expected_error():
     drawn = generator(1)
     said = Triplane(5, 8, generator=drawn).requires_grad_(False)
     positions = 2 * torch.rand(7, 3, generator=drawn) - 1
     parameters = torch.rand(7, 5, generator=drawn, requires_grad=True)
     errors = (parameters - said.parameters_at(positions)) ** 2
     expected = (errors / said.log_variance(positions).exp()).sum() / 7
-    found = _distance(said, parameters, positions)
+    found = prior_distance(said, parameters, positions)
     assert_close(found, expected)
     found.backward()
-    assert float(_distance(said, said.parameters_at(positions).detach(), positions)) < 1e-9
+    assert float(prior_distance(said, said.parameters_at(positions).detach(), positions)) < 1e-9
 
 
 def test_views_for_a_prior_are_the_training_views_thinned_out(tmp_path, monkeypatch):

@@ -26,7 +26,7 @@ from unmix_plugin.neumatex.export import pbr_fit
 from unmix_plugin.neumatex.export.material import material_paths
 from unmix_plugin.neumatex.fit import data_manager, start
 from unmix_plugin.neumatex.fit.data_manager import ObjectDataManagerConfig
-from unmix_plugin.neumatex.fit.model import NeumatexModel, _squared_error
+from unmix_plugin.neumatex.fit.model import NeumatexModel, unbiased_squared_error
 from unmix_plugin.neumatex.fit.settings import NeumatexModelConfig
 from unmix_plugin.neumatex.fit.start import _as_bright
 from unmix_plugin.neumatex.fit.trained_object import TrainedObject
@@ -143,9 +143,9 @@ def test_display_pictures_train_their_response(tmp_path):
 def test_the_loss_leaves_the_noise_of_the_render_out():
     noise = torch.randn(2, 40_000, 3, generator=generator())
     found = torch.ones(40_000, dtype=torch.bool)
-    assert float(_squared_error(0.3 + noise, found)) == pytest.approx(0.09, abs=0.02)
+    assert float(unbiased_squared_error(0.3 + noise, found)) == pytest.approx(0.09, abs=0.02)
     one_for_both = (0.3 + noise[0]).expand(2, -1, -1)
-    assert float(_squared_error(one_for_both, found)) > 1
+    assert float(unbiased_squared_error(one_for_both, found)) > 1
 
 
 @pytest.mark.parametrize(("material", "fit_networks"), [("pbr", False), ("neural", True)])
@@ -274,7 +274,7 @@ def test_the_number_of_materials_is_proposed_where_it_is_asked_for(tmp_path):
 def test_a_fit_starts_from_the_endmembers_and_abundances_of_a_run(tmp_path, monkeypatch):
     there = Normalisation(np.eye(3), -factory.CENTRE, ball_model.RADIUS / factory.RADIUS)
     of_run = replace(ball_model.ball_scene(), frame=there)
-    monkeypatch.setattr(start, "_opened", lambda _: of_run)
+    monkeypatch.setattr(start, "opened_run", lambda _: of_run)
     folder = write_spectral_object(tmp_path / "ball")
     settings = [SPECTRAL[0], "--pipeline.model.from-run=run", "--pipeline.datamanager.lamp=E"]
     model = load_model(trained_on(folder, *settings, steps=1), "cpu").model

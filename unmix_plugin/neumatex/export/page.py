@@ -10,7 +10,9 @@ Notation: `V` vertices, `F` faces, `N` rays a vertex, `S` sizes of a table.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,16 +29,14 @@ from unmix_plugin.neumatex.tracing.families import PbrFamily, SpectralFamily
 from unmix_plugin.neumatex.tracing.mesh import Mesh, mesh_of
 from unmix_plugin.neumatex.tracing.microfacet import alpha_of, frames, to_world
 from unmix_plugin.neumatex.tracing.rays import RayMesh
+from unmix_plugin.neumatex.tracing.surface import Surface
 from unmix_plugin.products.page.page import PageContent, rounded
+from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.colour.conversion import agx, linear_to_srgb, rgb_matrix
+from unmix_plugin.spectral.colour.conversion import agx, rgb_matrix
 from unmix_plugin.spectral.materials import Materials
-from unmix_plugin.trained.model_scene import LightChoice
 from unmix_plugin.trained.run_views import directions_to_world
 from unmix_plugin.trained.surface_mesh import vertex_areas
-
-if TYPE_CHECKING:
-    from unmix_plugin.neumatex.fit.trained_object import TrainedObject
 
 _MOST_TRIANGLES = 400_000
 _RAYS = 128
@@ -51,9 +51,27 @@ _TONES, _STOPS = 40, (-12.0, 5.0)
 """Of the table from light to what a display is given: sizes, and powers of 2 of its first and last light."""
 
 
-def page_content(scene: TrainedObject, resolution: int) -> PageContent:
+@dataclass(frozen=True)
+class ObjectForPage:
+    """An object as a page needs it."""
+
+    mesh: Mesh
+    """In model space, on the device to compute on."""
+    surface: Surface
+    bands: Bands | None
+    """Of spectral materials; None for colours."""
+    curve: Callable[[Float[Tensor, "*pixels C"]], Float[Tensor, "*pixels 3"]]
+    """From light to the sRGB numbers that are shown."""
+    frame: Normalisation
+    lights: Mapping[str, Environment]
+    """That it can be seen in, by name."""
+    pictures: Mapping[str, Float[Tensor, "H W 3"]]
+    """In sRGB, by title."""
+
+
+def page_content(scene: ObjectForPage, resolution: int) -> PageContent:
     """What a page shows of an object; its mesh has vertices about as dense as cells of the resolution."""
-    mesh = _resampled(scene.mesh, 2.0 / resolution).to(scene.device)
+    mesh = _resampled(scene.mesh, 2.0 / resolution).to(scene.mesh.vertices.device)
     family, notes, materials = scene.surface.family, [], None
     parameters = scene.surface.parameters(mesh.vertices)
     arrays: dict[str, np.ndarray] = {}
@@ -81,8 +99,7 @@ def page_content(scene: TrainedObject, resolution: int) -> PageContent:
     )
     mesh = mesh.to("cpu")
     openness = (transfer[:, :1] / _harmonics(torch.tensor([[0.0, 0.0, 1.0]]))[:, :1]).clamp(0, 1)
-    lights = [scene.with_light(LightChoice(name)).environment for name in scene.lights]
-    maps = [_picture(light, scene.bands) for light in lights]
+    maps = [_picture(light, scene.bands) for light in scene.lights.values()]
     areas = triangles.area(mesh.corners().double().numpy()) / scene.frame.scale**2
     arrays |= {
         "areas": vertex_areas(areas, mesh.faces.numpy(), len(mesh.vertices)),
@@ -108,12 +125,9 @@ def page_content(scene: TrainedObject, resolution: int) -> PageContent:
         "colour": "with the tones of the pictures; shadows are soft",
         "relit": {"map": [_MAP[1], _MAP[0], _LEVELS], "tones": _TONES, "stops": _STOPS},
     }
-    view = next((view for view in scene.views if view.split == "eval"), scene.views[0])
-    seen = scene.look(view.camera)
-    shown = {"in colour": seen["rgb"], "base colour": linear_to_srgb(seen["base_colour"].clamp(0, 1))}
     pictures = {
-        f"{view.name}, {name}": rgba_png_bytes((255 * values.clamp(0, 1)).round().byte().cpu().numpy())
-        for name, values in shown.items()
+        title: rgba_png_bytes((255 * values.clamp(0, 1)).round().byte().cpu().numpy())
+        for title, values in scene.pictures.items()
     }
     return PageContent(arrays, facts, pictures, materials)
 
@@ -220,10 +234,10 @@ def _blurred(pictures: Float[Tensor, "lights rows columns 3"]) -> Any:
     return whole.clamp(max=65504).half().flatten()
 
 
-def _tone_table(scene: TrainedObject) -> Any:
+def _tone_table(scene: ObjectForPage) -> Any:
     """What a display is given for light, as the texture of a cube: red runs fastest; (S * S * S * 4) bytes."""
     steps = 2 ** torch.linspace(*_STOPS, _TONES)
     light = torch.stack(torch.meshgrid(steps, steps, steps, indexing="ij")[::-1], dim=-1)
-    shown = agx(light) if scene.bands is not None else scene.curve(light.to(scene.device)).cpu()
+    shown = agx(light) if scene.bands is not None else scene.curve(light.to(scene.mesh.vertices.device)).cpu()
     whole = torch.cat([shown.clamp(0, 1), torch.ones_like(shown[..., :1])], dim=-1)
     return np.round(255 * whole.detach().numpy()).astype(np.uint8).reshape(-1)

@@ -8,26 +8,30 @@ Notation: `M` pixels that count, `C` colours, `B` bands, `T` true materials, `P`
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TypeAlias
 
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from unmix_plugin.engine import Cameras
 from unmix_plugin.figures.pictures import Canvas, CanvasLayout
-from unmix_plugin.neumatex.fit.tone import TONE_MAPPINGS, SpectralDisplay, psnr_db, tone_curve
+from unmix_plugin.neumatex.fit.tone import TONE_MAPPINGS, SpectralDisplay, ToneMapping, psnr_db
 from unmix_plugin.neumatex.tracing.environment import Environment
 from unmix_plugin.neumatex.tracing.families import MaterialFamily, SpectralFamily
+from unmix_plugin.neumatex.tracing.path_tracer import TracedObject
 from unmix_plugin.neumatex.tracing.rays import pixel_hits
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb
 from unmix_plugin.spectral.evidence import OPAQUE_ALPHA
 from unmix_plugin.spectral.metrics import abundance_rmse, endmember_angle, match_endmembers, spectral_angle
 
-if TYPE_CHECKING:
-    from unmix_plugin.neumatex.fit.model import NeumatexModel
-
+Compare: TypeAlias = Callable[
+    [Float[Tensor, "M C"], Float[Tensor, "M C"], ToneMapping],
+    tuple[Float[Tensor, "M 3"], Float[Tensor, "M 3"]],
+]
+"""From predicted light and a picture's numbers, which a tone mapping made of light, to what is compared."""
 SUBPIXELS = 2
 """Places of a pixel along each edge through which rays pass."""
 _PICTURE_PX = 512
@@ -37,25 +41,30 @@ _SPECTRAL_TRUTHS = ("base_colour_psnr", "reflectance_angle", "abundance_rmse", "
 
 
 def evaluation_outputs(
-    model: NeumatexModel, camera: Cameras, batch: dict[str, Tensor]
+    traced: TracedObject, camera: Cameras, batch: dict[str, Tensor], *, samples: int, bounces: int
 ) -> dict[str, Float[Tensor, "H W C"]]:
     """`light` and `base_colour`, both linear, and `parameters` of the material where pixels count, 0 elsewhere; in the
-    light that the batch may hold."""
-    traced = model.traced
+    light that the batch may hold, by so many paths a pixel."""
     if "environment" in batch:
         light = Environment(batch["environment"], *batch["environment_placement"].tolist())
         traced = replace(traced, environment=light)
     hits = pixel_hits(traced.ray_mesh, camera, 0, SUBPIXELS)
     hits = hits.select((batch["alpha"] >= OPAQUE_ALPHA).flatten()[hits.pixels])
-    generator = torch.Generator(model.device).manual_seed(0)
-    light = traced.light_of_rays(hits, model.config.eval_samples, model.config.bounces, generator)
+    generator = torch.Generator(traced.ray_mesh.device).manual_seed(0)
+    light = traced.light_of_rays(hits, samples, bounces, generator)
     parameters = traced.surface.parameters(hits.points.positions)
-    values = {"light": light, "base_colour": model.family.base_colour(parameters), "parameters": parameters}
+    base_colour = traced.surface.family.base_colour(parameters)
+    values = {"light": light, "base_colour": base_colour, "parameters": parameters}
     return {name: hits.image(value) for name, value in values.items()}
 
 
 def evaluate_object_image(
-    model: NeumatexModel, outputs: dict[str, Tensor], batch: dict[str, Tensor]
+    outputs: dict[str, Tensor],
+    batch: dict[str, Tensor],
+    *,
+    family: MaterialFamily,
+    display: nn.Module,
+    compare: Compare,
 ) -> tuple[dict[str, float], dict[str, Tensor]]:
     """Metrics and pictures, truth left and prediction right.
 
@@ -68,7 +77,7 @@ def evaluate_object_image(
     `abundance_rmse` and `endmember_angle` (mean over the true endmembers, each with its match). Where the truth is not
     known they are nan.
     """
-    shown, display = batch["alpha"] >= OPAQUE_ALPHA, model.curve
+    shown = batch["alpha"] >= OPAQUE_ALPHA
     light, numbers = outputs["light"][shown], batch["numbers"][shown]
     prefix = "relit_" if "environment" in batch else ""
     spectral: dict[str, float] = {}
@@ -77,8 +86,7 @@ def evaluate_object_image(
         colours = display(true), display(predicted)
         spectral[f"{prefix}sam"] = float(spectral_angle(predicted.double(), true.double()).mean())
     else:
-        tone = TONE_MAPPINGS[int(batch["tone"])]
-        predicted, true = model.compared(light, numbers, tone, tone_curve("agx"))
+        predicted, true = compare(light, numbers, TONE_MAPPINGS[int(batch["tone"])])
         colours = true, predicted
     error = (predicted - true).square()
     metrics: dict[str, float] = {
@@ -98,7 +106,7 @@ def evaluate_object_image(
         shares, endmembers = batch["true_abundances"][shown], batch["true_endmembers"]
         reflectance = shares @ endmembers
         colours = [display.rgb(values) for values in (reflectance, base)]
-        found = _material_metrics(model.family, outputs["parameters"][shown], base, shares, endmembers)
+        found = _material_metrics(family, outputs["parameters"][shown], base, shares, endmembers)
     else:
         if "base_colour" not in batch:
             return metrics | dict.fromkeys(_COLOUR_TRUTHS, float("nan")), pictures

@@ -15,6 +15,7 @@ and `B` bands of a spectral one; `H x W` pixels.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import cast
 
 import numpy as np
@@ -26,7 +27,7 @@ from unmix_plugin.engine import Cameras, Model, RayBundle, TrainingCallback, Tra
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.neumatex.fit.evaluation import evaluate_object_image, evaluation_outputs
 from unmix_plugin.neumatex.fit.settings import NeumatexModelConfig, ObjectRecord
-from unmix_plugin.neumatex.fit.start import start_plain, start_spectral, views_of
+from unmix_plugin.neumatex.fit.start import fit_abundances, spectral_start, start_plain, views_of
 from unmix_plugin.neumatex.fit.tone import LampRatio, SpectralDisplay, ToneMapping, psnr_db, tone_curve
 from unmix_plugin.neumatex.tracing.environment import Environment
 from unmix_plugin.neumatex.tracing.families import PbrFamily, SpectralFamily
@@ -81,7 +82,18 @@ class NeumatexModel(Model):
         for name in _empty_buffers(self.record):
             self.get_buffer(name).copy_(torch.from_numpy(initial_data[name]))
         if self.endmembers is not None:
-            start_spectral(self, initial_data, generator)
+            start = spectral_start(
+                self.traced,
+                initial_data,
+                generator,
+                count=len(self.endmembers),
+                method=self.config.endmember_init,
+                bands=self.record.bands,
+                from_run=self.config.from_run,
+            )
+            self.endmembers.copy_(start.endmembers)
+            start_plain(self.triplane, self.family)
+            fit_abundances(self.triplane, start, generator)
         elif self.prior is None:
             start_plain(self.triplane, self.family)
         else:
@@ -113,7 +125,10 @@ class NeumatexModel(Model):
         """Gains become the endmembers' own brightness."""
         if self.endmembers is None:
             return []
-        return [TrainingCallback(TrainingCallbackLocation.AFTER_TRAIN_ITERATION, self._settle_gains)]
+        family = self.family
+        assert isinstance(family, SpectralFamily)
+        after = TrainingCallbackLocation.AFTER_TRAIN_ITERATION
+        return [TrainingCallback(after, lambda _step, _progress: family.settle_gains())]
 
     @property
     def prior(self) -> Triplane | None:
@@ -169,29 +184,33 @@ class NeumatexModel(Model):
         residuals = self._residuals(outputs, batch)
         if isinstance(self.light_curve, LampRatio):
             residuals = residuals * self.light_curve.weights(batch["numbers"])
-        losses = {"picture": _squared_error(residuals, outputs["found"])}
+        losses = {"picture": unbiased_squared_error(residuals, outputs["found"])}
         if self.prior is not None and self.config.regularisation > 0:
             positions = outputs["positions"]
-            distance = _distance(self.prior, self.surface.parameters(positions), positions)
+            distance = prior_distance(self.prior, self.surface.parameters(positions), positions)
             losses["prior"] = self.config.regularisation * distance
         return losses
 
     def get_metrics_dict(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """PSNR of the batch, the noise of its few samples left out."""
         with torch.no_grad():
-            error = _squared_error(self._residuals(outputs, batch), outputs["found"])
+            error = unbiased_squared_error(self._residuals(outputs, batch), outputs["found"])
         return {"psnr": psnr_db(error)}
 
     @torch.no_grad()
     def get_evaluation_outputs(self, camera: Cameras, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """Light and base colour of the pixels that count, under the light that the batch may hold."""
-        return evaluation_outputs(self, camera.to(self.device), batch)
+        samples, bounces = self.config.eval_samples, self.config.bounces
+        return evaluation_outputs(
+            self.traced, camera.to(self.device), batch, samples=samples, bounces=bounces
+        )
 
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
         """Figures and pictures of one view."""
-        return evaluate_object_image(self, outputs, batch)
+        compare = partial(self.compared, light_curve=tone_curve("agx"))
+        return evaluate_object_image(outputs, batch, family=self.family, display=self.curve, compare=compare)
 
     def warm_up(self) -> None:
         """Compile the kernels, forward and backward, on a few rays that meet the mesh."""
@@ -248,12 +267,8 @@ class NeumatexModel(Model):
             raise ConfigError(f"num-endmembers is {count} but the pictures have {bands} bands; choose fewer")
         return count
 
-    def _settle_gains(self, step: int, progress: float) -> None:
-        assert isinstance(self.family, SpectralFamily)
-        self.family.settle_gains()
 
-
-def _distance(
+def prior_distance(
     prior: Triplane, parameters: Float[Tensor, "N P"], positions: Float[Tensor, "N 3"]
 ) -> Float[Tensor, ""]:
     """Squared distance of parameters from the prior's, each over its expected squared error; mean over the points of
@@ -263,7 +278,7 @@ def _distance(
     return ((parameters - expected).square() * precision).sum(dim=-1).mean()
 
 
-def _squared_error(residuals: Float[Tensor, "2 R C"], found: Tensor) -> Float[Tensor, ""]:
+def unbiased_squared_error(residuals: Float[Tensor, "2 R C"], found: Tensor) -> Float[Tensor, ""]:
     """Mean over the pixels that meet the mesh; may be below 0 by chance where the error is small."""
     products = residuals[0] * residuals[1] * found[:, None]
     return products.sum() / (found.sum().clamp(min=1) * residuals.shape[-1])

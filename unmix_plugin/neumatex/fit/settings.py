@@ -24,6 +24,7 @@ Auto = Literal["auto"]
 PriorName = Literal["small", "none"]
 MaterialName = Literal["neural", "pbr", "spectral"]
 """Families that can be trained."""
+_USUAL_ENDMEMBERS = 6
 
 
 @dataclass(frozen=True)
@@ -167,7 +168,18 @@ class NeumatexModelConfig(ModelConfig):
         nor saturated. Raises ConfigError, RunError: the run to start from is unusable."""
         if self.material != "spectral" or isinstance(self.num_endmembers, int):
             return self, ""
-        from unmix_plugin.neumatex.fit.start import resolved_num_endmembers
+        arrays = initial_data()
+        if "lamp" not in arrays:  # pictures in colours, which the model refuses
+            return replace(self, num_endmembers=_USUAL_ENDMEMBERS), ""
+        if self.from_run is not None:
+            from unmix_plugin.neumatex.fit.start import opened_run
 
-        count, reason = resolved_num_endmembers(self, initial_data(), generator)
-        return replace(self, num_endmembers=count), reason
+            return replace(self, num_endmembers=len(opened_run(self.from_run).materials.endmembers)), ""
+        if self.num_endmembers is None:
+            return replace(self, num_endmembers=min(_USUAL_ENDMEMBERS, len(arrays["lamp"]))), ""
+        from unmix_plugin.spectral.unmixing.endmembers import drop_uninformative_pixels
+        from unmix_plugin.spectral.unmixing.num_materials import propose_num_materials
+
+        pixels = drop_uninformative_pixels(torch.from_numpy(arrays["pixels"] / arrays["lamp"]).float())
+        count = propose_num_materials(pixels, generator)
+        return replace(self, num_endmembers=count.number), count.evidence()

@@ -1,8 +1,8 @@
 """Where a fit begins: at a plain grey material, at the prior's, or at spectra of the pictures or of another run.
 
 Mesh and light are known, so a pixel's radiance over what a white surface would send there is about its reflectance,
-shadows and all. For a spectral material these spectra are unmixed one by one, and the planes are fitted to the shares
-that come out; or a run of unmix-nerf gives endmembers and abundances.
+shadows and all. For a spectral material these spectra are unmixed one by one, and the planes are fitted to the
+abundances that come out; or a run of unmix-nerf gives endmembers and abundances.
 
 Notation: `N` points, `P` parameters, `V` views of `H x W` pixels, `B` bands, `K` endmembers.
 """
@@ -14,7 +14,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -32,15 +31,10 @@ from unmix_plugin.neumatex.tracing.rays import SurfacePoints
 from unmix_plugin.neumatex.tracing.surface import Triplane
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.unmixing.abundances import fcls
-from unmix_plugin.spectral.unmixing.endmembers import drop_uninformative_pixels, initialise_endmembers
-from unmix_plugin.spectral.unmixing.num_materials import propose_num_materials
+from unmix_plugin.spectral.unmixing.endmembers import EndmemberMethod, initialise_endmembers
 from unmix_plugin.trained.open_run import open_run
 from unmix_plugin.trained.surface import look_from_above
 from unmix_plugin.trained.trained_scene import TrainedScene
-
-if TYPE_CHECKING:
-    from unmix_plugin.neumatex.fit.model import NeumatexModel
-    from unmix_plugin.neumatex.fit.settings import NeumatexModelConfig
 
 _PLAIN_GLOSS = (0.5, 0.2)
 """Roughness and specular level of a common dielectric, half rough."""
@@ -50,7 +44,6 @@ _START_PLANES = 0.2
 """Of the planes' random values: texels that few pixels see keep theirs, which shows as grain."""
 _START_SPREAD = 0.3
 """Of the last layer's random weights."""
-_USUAL_ENDMEMBERS = 6
 _SAMPLES = 64
 _DARKEST = 0.1
 """Light on a pixel, as a part of the median, below which its reflectance is noise."""
@@ -103,48 +96,49 @@ def views_of(arrays: Mapping[str, np.ndarray]) -> PosedViews:
     return PosedViews(cameras, lights, alphas)
 
 
-def resolved_num_endmembers(
-    config: NeumatexModelConfig, arrays: Mapping[str, np.ndarray], generator: torch.Generator
-) -> tuple[int, str]:
-    """K where the settings leave it open, and why; see `NeumatexModelConfig.resolve_auto`."""
-    if "lamp" not in arrays:  # pictures in colours, which the model refuses
-        return _USUAL_ENDMEMBERS, ""
-    if config.from_run is not None:
-        return len(_opened(config.from_run).materials.endmembers), ""
-    if config.num_endmembers is None:
-        return min(_USUAL_ENDMEMBERS, len(arrays["lamp"])), ""
-    pixels = drop_uninformative_pixels(torch.from_numpy(arrays["pixels"] / arrays["lamp"]).float())
-    count = propose_num_materials(pixels, generator)
-    return count.number, count.evidence()
+@dataclass(frozen=True)
+class SpectralStart:
+    """Where the fit of a spectral material starts: endmembers, and what points of the surface are made of."""
+
+    endmembers: Float[Tensor, "K B"]
+    positions: Float[Tensor, "N 3"]
+    abundances: Float[Tensor, "N K"]
 
 
-def start_spectral(
-    model: NeumatexModel, arrays: Mapping[str, np.ndarray], generator: torch.Generator
-) -> None:
-    """Give a new model its first endmembers and abundances. Raises SpectrumError: the pixels don't allow so many.
-    Raises ConfigError, RunError: the run to start from is unusable."""
-    assert model.endmembers is not None
+def spectral_start(
+    traced: TracedObject,
+    arrays: Mapping[str, np.ndarray],
+    generator: torch.Generator,
+    *,
+    count: int,
+    method: EndmemberMethod,
+    bands: Bands | None,
+    from_run: Path | None,
+) -> SpectralStart:
+    """First endmembers, so many by this method or those of a run, and abundances where light falls on an object.
+
+    Raises:
+        SpectrumError: the pixels don't allow so many.
+        ConfigError, RunError: the run to start from is unusable.
+    """
     pixels, origins, directions = (
-        torch.from_numpy(arrays[name]).to(model.device)
+        torch.from_numpy(arrays[name]).to(traced.ray_mesh.device)
         for name in ("pixels", "pixel_origins", "pixel_directions")
     )
-    found, points = model.traced.ray_mesh.seen(origins, directions)
-    reflectance, is_lit = _apparent_reflectance(model.traced, points, pixels[found])
+    found, points = traced.ray_mesh.seen(origins, directions)
+    reflectance, is_lit = _apparent_reflectance(traced, points, pixels[found])
     points, reflectance = points.select(is_lit), reflectance[is_lit]
-    count, path = len(model.endmembers), model.config.from_run
-    if path is None:
-        first = initialise_endmembers(reflectance, count, model.config.endmember_init, generator)
+    if from_run is None:
+        first = initialise_endmembers(reflectance, count, method, generator)
         purity = normalize(reflectance, dim=1) @ normalize(first, dim=1).T
         endmembers = _as_bright(first, reflectance, purity)
-        shares = fcls(reflectance, endmembers)
+        abundances = fcls(reflectance, endmembers)
     else:
-        run = _RunMaterials(path, _opened(path))
-        first = run.reflectances(model.record.bands, arrays["lamp"], count).to(reflectance)
-        shares = run.abundances(points.positions, points.geometric_normals, arrays["world_corners"])
-        endmembers = _as_bright(first, reflectance, shares)
-    model.endmembers.copy_(endmembers)
-    start_plain(model.triplane, model.family)
-    _fit_shares(model.triplane, points.positions, shares, generator)
+        run = _RunMaterials(from_run, opened_run(from_run))
+        first = run.reflectances(bands, arrays["lamp"], count).to(reflectance)
+        abundances = run.abundances(points.positions, points.geometric_normals, arrays["world_corners"])
+        endmembers = _as_bright(first, reflectance, abundances)
+    return SpectralStart(endmembers, points.positions, abundances)
 
 
 @torch.no_grad()
@@ -190,13 +184,9 @@ def _as_bright(
     return bright / bright.amax(dim=1, keepdim=True).clamp(min=1)
 
 
-def _fit_shares(
-    triplane: Triplane,
-    positions: Float[Tensor, "N 3"],
-    shares: Float[Tensor, "N K"],
-    generator: torch.Generator,
-) -> None:
-    """Fit planes and networks to shares at points; the other parameters stay where they are."""
+def fit_abundances(triplane: Triplane, start: SpectralStart, generator: torch.Generator) -> None:
+    """Fit planes and networks to abundances at points; the other parameters stay where they are."""
+    positions, abundances = start.positions, start.abundances
     fitted = copy.deepcopy(triplane).requires_grad_(True)
     with torch.no_grad():
         others = triplane.parameters_at(positions)[:, triplane.readers.num_shares :]
@@ -204,8 +194,8 @@ def _fit_shares(
     with torch.enable_grad():
         for _ in range(_STEPS):
             chosen = torch.randint(len(positions), (_POINTS,), generator=generator).to(positions.device)
-            found, kept = fitted.parameters_at(positions[chosen]).tensor_split([shares.shape[1]], dim=1)
-            distance = -(shares[chosen] * found.clamp(min=1e-6).log()).sum(dim=1).mean()
+            found, kept = fitted.parameters_at(positions[chosen]).tensor_split([abundances.shape[1]], dim=1)
+            distance = -(abundances[chosen] * found.clamp(min=1e-6).log()).sum(dim=1).mean()
             kept = (kept - others[chosen]).square().sum(dim=1).mean()
             optimiser.zero_grad()
             (distance + kept).backward()
@@ -214,7 +204,7 @@ def _fit_shares(
 
 
 @lru_cache(maxsize=1)
-def _opened(path: Path) -> TrainedScene:
+def opened_run(path: Path) -> TrainedScene:
     """The scene of a run folder, which is read once."""
     return open_run(path, "cpu")
 

@@ -30,6 +30,7 @@ from unmix_plugin.neumatex.tracing.rays import PixelHits, RayMesh, pixel_hits
 from unmix_plugin.neumatex.tracing.surface import Surface
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.colour.conversion import linear_to_srgb
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.spectral.segmentation import material_ids
 from unmix_plugin.trained.model_scene import LightChoice, ModelView, frozen_parameters
@@ -251,9 +252,21 @@ class TrainedObject:
     @torch.no_grad()
     def page_content(self, resolution: int) -> PageContent:
         """What `unmix-export page` shows of it, with about so many vertices along the longest edge."""
-        from unmix_plugin.neumatex.export.page import page_content
+        from unmix_plugin.neumatex.export.page import ObjectForPage, page_content
 
-        return page_content(self, resolution)
+        view = next((view for view in self.views if view.split == "eval"), self.views[0])
+        seen = self.look(view.camera)
+        base_colour = linear_to_srgb(seen["base_colour"].clamp(0, 1))
+        shown = ObjectForPage(
+            mesh=self.mesh,
+            surface=self.surface,
+            bands=self.bands,
+            curve=self.curve,
+            frame=self.frame,
+            lights={name: self.with_light(LightChoice(name)).environment for name in self.lights},
+            pictures={f"{view.name}, in colour": seen["rgb"], f"{view.name}, base colour": base_colour},
+        )
+        return page_content(shown, resolution)
 
     @torch.no_grad()
     def _rendered(self, camera: Cameras, subpixels: int, samples: int, number: int) -> ModelView:
