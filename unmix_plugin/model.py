@@ -37,8 +37,8 @@ from unmix_plugin.field import FieldSpace, GridField, UnmixField
 from unmix_plugin.light.lamp import Lamp
 from unmix_plugin.light.shading import ShadowDetail
 from unmix_plugin.losses.abundance_guide import AbundanceGuide, first_endmembers, first_specular_spectra
-from unmix_plugin.losses.comparison import BatchComparison, ComparedPixels, loss_weights
-from unmix_plugin.losses.geometry import normals_error, stray_light
+from unmix_plugin.losses.comparison import BatchComparison, ComparedPixels
+from unmix_plugin.losses.terms import loss_weights, normals_error, stray_light
 from unmix_plugin.operators.occupancy import OccupancyGrid
 from unmix_plugin.poses.refinement import PoseRefinement
 from unmix_plugin.poses.training import CorrectedRays, PoseTraining
@@ -59,6 +59,8 @@ from unmix_plugin.spectral.metrics import psnr
 SAMPLES_ON_CPU, SAMPLES_ON_GPU = 25_000, 400_000
 """That a training step looks at; a GPU takes no longer for so many than the processor does to tell it what to do."""
 _FEWEST_RAYS, _FEWEST_SAMPLES_A_RAY = 64, 3
+_COARSE_PART = 0.5
+"""Part of the training in which samples move together to the distance they have in the end."""
 _FIRST_PART = 0.05
 """Part of the training in which lighter samples may have gradients than later."""
 
@@ -220,7 +222,6 @@ class UnmixModel(Model):
         self.balance = BandBalance(weights, scene.bands, self.seen_by)
         self.comparison = BatchComparison(
             config.losses,
-            scene.preset,
             seen_by=self.seen_by,
             balance=self.balance,
             guide=self.guide,
@@ -247,13 +248,13 @@ class UnmixModel(Model):
         lamp = torch.ones(len(self.bands)) if light is None else torch.tensor(light, dtype=torch.float32)
         endmembers = first_endmembers(
             self.config,
-            self.num_endmembers,
-            self.balance,
-            self.seen_by,
-            lamp,
-            self.bands,
             initial_data,
             generator,
+            count=self.num_endmembers,
+            balance=self.balance,
+            sensors=self.seen_by,
+            lamp=lamp,
+            bands=self.bands,
         )
         self.endmembers.copy_(endmembers)
         self.endmember_bound.fill_(max(1.0, float(endmembers.max())))
@@ -355,7 +356,7 @@ class UnmixModel(Model):
         """Weighted losses by name, and `poses`, what their corrections cost; changes nothing."""
         config, rendered = self.config, step.rendered
         weights = loss_weights(config.losses, self.preset, self._progress, config.as_published)
-        losses = self.comparison.losses(step.compared, set(weights), self.generator)
+        losses = self.comparison.losses(step.compared, weights, self.generator)
         losses["sparsity"], losses["certainty"] = rendered.sparsity, rendered.certainty
         surfaces = [part.measured.surfaces_of_rays() for part in step.compared]
         if "surface" in weights and (known := [each for each in surfaces if each is not None]):
@@ -435,8 +436,10 @@ class UnmixModel(Model):
 
     def next_num_rays(self, outputs: dict[str, Tensor], current: int) -> int | None:
         """Half of the way to the rays with which a step would have `samples_per_step`."""
-        usual = SAMPLES_ON_CPU if self.device.type == "cpu" else SAMPLES_ON_GPU
-        samples = choose(self.config.samples_per_step, usual) / self.processes.count
+        samples = self.config.samples_per_step
+        if samples == "auto":  # of a run from before it was settled
+            samples = SAMPLES_ON_CPU if self.device.type == "cpu" else SAMPLES_ON_GPU
+        samples = samples / self.processes.count
         samples_a_ray = max(self.num_samples(outputs) / current, _FEWEST_SAMPLES_A_RAY)
         return max(int(current + samples / samples_a_ray) // 2, _FEWEST_RAYS)
 
@@ -471,7 +474,9 @@ class UnmixModel(Model):
 
     def _coarseness(self, progress: float) -> float:
         """How many times farther apart samples are in training than in the end: large images begin coarsely."""
-        return self.config.renderer.coarseness(self.longest_edge / self.step, progress)
+        samples_along_box = self.longest_edge / self.step
+        to_go = max(1.0 - progress / _COARSE_PART, 0.0)
+        return max(samples_along_box / float(self.config.renderer.coarse_samples), 1.0) ** to_go
 
     def _begin_step(self, step: int, progress: float) -> None:
         self._progress = progress
@@ -483,8 +488,8 @@ class UnmixModel(Model):
                 self._training_renderer,
                 self.processes,
                 self.generator,
-                self._progress,
-                self.metadata.get("num_train_pixels", 0),
+                progress=progress,
+                num_pixels=self.metadata.get("num_train_pixels", 0),
             )
             self._occupied_share = self.grid.occupied.float().mean()
             self.processes.reduce(self.guide.margin_variance, "mean")

@@ -32,8 +32,6 @@ _FEWEST_LOG2_ROWS, _MOST_LOG2_ROWS = 16, 19
 COARSEST_REFINED = 4
 """Cells along the scene box on the coarsest level at most where poses are refined: a pose that is off by a cell still
 finds its way."""
-COARSE_PART = 0.5
-"""Part of the training in which samples move together to the distance they have in the end."""
 _LARGE_BOX = 300
 """Pixels along the scene box from which on fewer samples a pixel do."""
 _USUAL_ENDMEMBERS = 6
@@ -241,12 +239,6 @@ class RendererConfig:
             visible_weight=choose(self.visible_weight, preset.visible_weight),
         )
 
-    def coarseness(self, samples: float, progress: float) -> float:
-        """Factor on the distance of samples, of which so many lie along the longest edge of the scene box in the end,
-        when that part of the training is over."""
-        left = max(1.0 - progress / COARSE_PART, 0.0)
-        return max(samples / float(self.coarse_samples), 1.0) ** left
-
 
 @dataclass(frozen=True)
 class LossConfig:
@@ -302,25 +294,6 @@ class PoseConfig:
     """Steps in which they join at most: what is coarse hardly holds poses, and they drift."""
     start: Ours[float] = 0.1
     """Part of the coarse part before which poses stay: the field must show something first."""
-
-    def fineness(self, step: int, progress: float) -> float:
-        """How much of the coarse part is over in [0, 1], after some steps and that part of the training.
-
-        >>> PoseConfig(coarse_until=0.3, coarse_steps=900).fineness(100, 0.15)
-        0.5
-        """
-        if progress >= self.coarse_until or step >= self.coarse_steps:
-            return 1.0
-        return max(progress / self.coarse_until, step / self.coarse_steps)
-
-    def level_weights(self, num_levels: int, share: float) -> list[float]:
-        """Weights in [0, 1] of a grid's levels when that share of the coarse part is over.
-
-        >>> PoseConfig().level_weights(4, 0.25)
-        [1.0, 0.853553390593, 0.0, 0.0]
-        """
-        joined = [min(max(1 + share * (num_levels - 1) - level, 0.0), 1.0) for level in range(num_levels)]
-        return [1.0 if x == 1 else round(0.5 - 0.5 * math.cos(math.pi * x), 12) for x in joined]
 
 
 @dataclass(frozen=True)

@@ -134,7 +134,7 @@ def test_a_world_without_end_begins_with_cells_as_large_as_those_of_a_coarse_gri
         renderer = replace(make()[0], is_unbounded=is_unbounded)
         grid = Watched(torch.ones(128, 128, 128) > 0)
         for progress in (0.0, 0.4, 0.6):
-            update_grid(grid, make()[1], renderer, Processes(), None, progress)
+            update_grid(grid, make()[1], renderer, Processes(), None, progress=progress)
     assert blocks == [2, 2, 1, 1, 1, 1]
 
 

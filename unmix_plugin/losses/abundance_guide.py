@@ -77,14 +77,12 @@ class AbundanceGuide(nn.Module):
         self.endmembers.copy_(endmembers)
         self.penalty.fill_(mixing_penalty(pixels, seen))
 
-    def error(
-        self, abundances: Float[Tensor, "R K"], measured: MeasuredPixels, endmembers: Float[Tensor, "K b"]
-    ) -> Float[Tensor, ""]:
-        """Mean squared distance of composited abundances, which sum to the opacity, to what pixels are made
-        of, in endmembers of the guide as their sensor sees them."""
-        mixtures = measured.alpha[:, None] * self._mixtures_of(measured, endmembers)
-        distances = (abundances - mixtures).square().sum(dim=1)
-        return torch.where(_is_informative(measured), distances, 0.0).mean()
+    def targets(
+        self, measured: MeasuredPixels, endmembers: Float[Tensor, "K b"]
+    ) -> tuple[Float[Tensor, "R K"], Bool[Tensor, "R"]]:
+        """What pixels are made of, in endmembers of the guide as their sensor sees them, summing to alpha as composited
+        abundances sum to the opacity; and which pixels tell."""
+        return measured.alpha[:, None] * self._mixtures_of(measured, endmembers), _is_informative(measured)
 
     def update(
         self, abundances: Float[Tensor, "R K"], measured: MeasuredPixels, endmembers: Float[Tensor, "K b"]
@@ -147,22 +145,22 @@ def mixing_penalty(pixels: Float[Tensor, "N B"], endmembers: Float[Tensor, "K B"
     """
     informative = normalize(drop_uninformative_pixels(pixels), dim=1)
     corners = normalize(endmembers.to(pixels), dim=1)
-    left = (informative - nnls(informative, corners) @ corners).norm(dim=1).double().sum() / max(
-        1, len(informative)
-    )
-    gain = max(0.0, mean_pair_distance(informative, corners) - float(left))
+    residuals = (informative - nnls(informative, corners) @ corners).norm(dim=1).double()
+    unexplained = residuals.sum() / max(1, len(informative))
+    gain = max(0.0, mean_pair_distance(informative, corners) - float(unexplained))
     return _RELATIVE_PENALTY * min(gain / _CLEAR_GAIN, 1.0) * gain
 
 
 def first_endmembers(
     config: UnmixModelConfig,
+    initial_data: Mapping[str, np.ndarray],
+    generator: torch.Generator,
+    *,
     count: int,
     balance: BandBalance,
     sensors: SensorViews,
     lamp: Float[Tensor, "B"],
     bands: Bands,
-    initial_data: Mapping[str, np.ndarray],
-    generator: torch.Generator,
 ) -> Float[Tensor, "K B"]:
     """The first K = `count` endmembers, on all bands; reflectances of a file are multiplied by the lamp's spectrum.
 
@@ -185,7 +183,7 @@ def first_endmembers(
 def first_specular_spectra(
     count: int, lamp: Float[Tensor, "B"], endmembers: Float[Tensor, "K B"]
 ) -> Float[Tensor, "count B"]:
-    """The dictionary of gloss at the start: the lamp's spectrum, then the endmembers in turn."""
+    """The specular dictionary at the start: the lamp's spectrum, then the endmembers in turn."""
     rows = [lamp if row == 0 else endmembers[(row - 1) % len(endmembers)] for row in range(count)]
     return torch.stack(rows) if rows else endmembers[:0]
 

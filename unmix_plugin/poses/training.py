@@ -8,6 +8,7 @@ Notation: `X x Y x Z` cells of the occupancy grid, `N` rays, `M` knots of all vi
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
@@ -22,7 +23,7 @@ from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
 from unmix_plugin.engine.model import DataManager
 from unmix_plugin.engine.processes import Processes
 from unmix_plugin.field import CoefficientField, GridField
-from unmix_plugin.losses.comparison import BatchComparison, ComparedPixels
+from unmix_plugin.losses.comparison import ComparedPixels, pose_errors
 from unmix_plugin.poses.refinement import PoseRefinement
 from unmix_plugin.settings import PoseConfig
 
@@ -49,6 +50,27 @@ class CorrectedRays:
     """By which rays shape the scene: less where their pose is an outlier."""
 
 
+def fineness(config: PoseConfig, step: int, progress: float) -> float:
+    """How much of the coarse part is over in [0, 1], after some steps and that part of the training.
+
+    >>> fineness(PoseConfig(coarse_until=0.3, coarse_steps=900), 100, 0.15)
+    0.5
+    """
+    if progress >= config.coarse_until or step >= config.coarse_steps:
+        return 1.0
+    return max(progress / config.coarse_until, step / config.coarse_steps)
+
+
+def level_weights(num_levels: int, part: float) -> list[float]:
+    """Weights in [0, 1] of a grid's levels when that part of the coarse training is over.
+
+    >>> level_weights(4, 0.25)
+    [1.0, 0.853553390593, 0.0, 0.0]
+    """
+    joined = [min(max(1 + part * (num_levels - 1) - level, 0.0), 1.0) for level in range(num_levels)]
+    return [1.0 if x == 1 else round(0.5 - 0.5 * math.cos(math.pi * x), 12) for x in joined]
+
+
 class PoseTraining:
     """How far the refinement of poses has come."""
 
@@ -72,9 +94,9 @@ class PoseTraining:
 
     def begin_step(self, step: int, progress: float, field: CoefficientField) -> None:
         """Let as many levels of the field's grid join as it is time for."""
-        self._fineness = self._config.fineness(step, progress)
+        self._fineness = fineness(self._config, step, progress)
         if isinstance(field, GridField) and field.level_weights is not None:
-            levels = self._config.level_weights(len(field.level_weights), self._fineness)
+            levels = level_weights(len(field.level_weights), self._fineness)
             field.level_weights.copy_(torch.tensor(levels))
 
     def end_step(self) -> None:
@@ -110,7 +132,7 @@ class PoseTraining:
     def update(self, compared: Sequence[ComparedPixels], corrected: CorrectedRays) -> None:
         """Note how well pixels fit, as far as it tells of their poses."""
         if self._poses is not None and corrected.knots is not None:
-            self._poses.robust.update(*BatchComparison.pose_errors(compared, corrected.knots))
+            self._poses.robust.update(*pose_errors(compared, corrected.knots))
 
     def update_weights(self, processes: Processes) -> None:
         """Decide which poses are outliers."""

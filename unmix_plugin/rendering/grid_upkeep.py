@@ -40,6 +40,7 @@ def update_grid(
     renderer: VolumeRenderer,
     processes: Processes,
     generator: torch.Generator | None,
+    *,
     progress: float,
     num_pixels: int = 0,
 ) -> None:

@@ -15,8 +15,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from unmix_plugin.spectral.colour.conversion import linear_to_srgb
-
 OPAQUE_ALPHA = 0.99
 """From which on a pixel shows nothing of what is behind it."""
 _TRANSPARENT = 0.5 / 255
@@ -155,18 +153,3 @@ def solid_evidence(measured: Float[Tensor, "R B"]) -> Float[Tensor, "R"]:
     A black pixel may show a black thing or nothing, such as what lies beside an open room.
     """
     return (brightness(measured) / _SURELY_LIT).clamp(max=1)
-
-
-def srgb_error(
-    pred_spectra: Float[Tensor, "R B"],
-    target_spectra: Float[Tensor, "R B"],
-    rgb_weights: Float[Tensor, "B 3"],
-    outliers: Float[Tensor, "R 1"],
-) -> Float[Tensor, ""]:
-    """Mean squared difference of the sRGB colours of two sets of spectra, bounded as `bounded_square` does.
-
-    Against the colours of the measured spectra, not of a picture file: another colour pipeline than ours there would
-    contradict the spectra.
-    """
-    colours = linear_to_srgb(torch.stack([pred_spectra, target_spectra]) @ rgb_weights)
-    return bounded_square(colours[0] - colours[1], outliers).mean()
