@@ -88,7 +88,7 @@ class HyperspectralDataManager(DataManager):
 
             data = demo_scene_path()
         self.scene = load_scene(data, config.scene)
-        self.scene_box = self.scene.scene_box
+        self.scene_box, self._is_rig = self.scene.scene_box, self.scene.is_rig
         self.train_cameras = self.scene.cameras[list(self.scene.train_indices)]
         self.eval_cameras = self.scene.cameras[list(self.scene.eval_indices)]
         self._rays = PixelRays(self.scene, device)
@@ -108,7 +108,7 @@ class HyperspectralDataManager(DataManager):
         for drawn in self._pixels.draw(self._pixels_for(self._num_rays), generator, step, self._shares):
             rays.append(self._rays.through(drawn, self._subpixels, generator))
             own = MeasuredPixels(
-                sensor=drawn.sensor if self.scene.is_rig else None,
+                sensor=drawn.sensor if self._is_rig else None,
                 num_rays=len(rays[-1]),
                 spectra=drawn.spectra,
                 alpha=drawn.alpha,
@@ -130,7 +130,7 @@ class HyperspectralDataManager(DataManager):
             "labels": self.scene.labels(view),
             "abundances": self.scene.abundances(view),
         }
-        if self.scene.is_rig:
+        if self._is_rig:
             arrays["sensor"] = np.array(self.scene.frames[view].sensor)
         batch = {
             name: torch.from_numpy(np.require(array, requirements="W")).to(self.device)
@@ -200,7 +200,7 @@ class HyperspectralDataManager(DataManager):
             "band_weights": band_weights(self.scene, self._noise),
             **self._light(reachable),
         }
-        if not self.scene.is_rig:
+        if not self._is_rig:
             return found
         pixels = [self._pixels.sample_opaque(sensor, most, seed) for sensor in shares]
         means = [seen.mean(dim=0) if len(seen) else seen.new_zeros(seen.shape[1]) for seen in pixels]
@@ -252,7 +252,7 @@ class HyperspectralDataManager(DataManager):
                 "pictures have no alpha, but share a plain backdrop: it is learnt as what lies behind the scene, and "
                 "no matter is sought where they show it (--world bounded or unbounded does without)"
             )
-        found += rig_warnings(self.scene, self._initial_data["reachable"]) if self.scene.is_rig else []
+        found += rig_warnings(self.scene, self._initial_data["reachable"]) if self._is_rig else []
         return [warning for warning in found if warning is not None]
 
     def identity(self, summary: Mapping[str, Any]) -> dict[str, Any]:
@@ -316,7 +316,7 @@ class HyperspectralDataManager(DataManager):
     @cached_property
     def _shares(self) -> dict[int, float] | None:
         """Of the pixels of a batch, by sensor of a rig."""
-        return self._rays.shares(self._pixels.shares) if self.scene.is_rig else None
+        return self._rays.shares(self._pixels.shares) if self._is_rig else None
 
     def _choose_subpixels(self, step: int, progress: float) -> None:
         is_coarse = progress < float(self.options.single_ray_until)

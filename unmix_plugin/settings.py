@@ -1,7 +1,7 @@
 """All that a user can set of the method and of its data; what follows from the scene is found by `resolve_auto`.
 
 Nothing here imports what it sets up, so that the help of commands is quick. Settings that only tests and the method as
-published need are annotated with `Ours`: they work as flags, but no help lists them.
+published need are annotated with `Unlisted`: they work as flags, but no help lists them.
 """
 
 from __future__ import annotations
@@ -12,7 +12,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
-from unmix_plugin.engine.configs import AtStart, Common, DataManagerConfig, Hidden, ModelConfig, Target, short
+from unmix_plugin.engine.configs import (
+    AtStartOnly,
+    CommonFlag,
+    DataManagerConfig,
+    ModelConfig,
+    Target,
+    UnlistedFlag,
+    short_flag,
+)
 from unmix_plugin.errors import Check, ConfigError, require
 from unmix_plugin.presets import AlphaPreset, Auto, choose, preset_for
 
@@ -23,7 +31,7 @@ if TYPE_CHECKING:
 Light = Literal["fixed", "camera", "per-view"]
 EndmemberInit = Literal["kmeans", "vca", "nfindr", "minimum-volume", "pairs", "pooled", "file"]
 T = TypeVar("T")
-Ours = Annotated[T, Hidden]
+Unlisted = Annotated[T, UnlistedFlag]
 
 LARGEST_RESOLUTION = 4096
 """Cells along an edge of a hash grid."""
@@ -64,19 +72,21 @@ def _within(value: float | int | str, low: float | int, high: float | int = math
 class SceneOptions:
     """How to read a scene."""
 
-    value_scale: Annotated[float | None, Common, AtStart, short("value-scale")] = None
+    value_scale: Annotated[float | None, CommonFlag, AtStartOnly, short_flag("value-scale")] = None
     """Cubes are divided by this number (needed for integer cubes, such as 255 or 4095); None takes them as they are."""
-    invalid_pixels: Annotated[Literal["refuse", "mask", "clip"], Common, short("invalid-pixels")] = "refuse"
+    invalid_pixels: Annotated[Literal["refuse", "mask", "clip"], CommonFlag, short_flag("invalid-pixels")] = (
+        "refuse"
+    )
     """What to do with pixels that hold NaN, infinite or negative values: refuse the scene; leave them out (mask); or
     set negative values to 0, as suits noise around black, and leave the others out (clip)."""
-    allow_outside_paths: Annotated[bool, short("allow-outside-paths")] = False
+    allow_outside_paths: Annotated[bool, short_flag("allow-outside-paths")] = False
     """Follow paths in transforms.json that lead out of the scene folder (`..`, absolute, symbolic links)."""
-    eval_split: Annotated[Literal["auto", "lists", "filename", "interval"], short("eval-split")] = "auto"
+    eval_split: Annotated[Literal["auto", "lists", "filename", "interval"], short_flag("eval-split")] = "auto"
     """Evaluation frames by the lists of transforms.json, by folder or file name, or every n-th; auto takes the first
     of these that the scene supports."""
-    eval_interval: Annotated[int, short("eval-interval")] = 8
+    eval_interval: Annotated[int, short_flag("eval-interval")] = 8
     """With an interval split every n-th frame from the first on, or of a rig every n-th shot, is for evaluation."""
-    world: Annotated[Literal["bounded", "unbounded", "auto"], Common, short("world")] = "auto"
+    world: Annotated[Literal["bounded", "unbounded", "auto"], CommonFlag, short_flag("world")] = "auto"
     """Whether all that pictures show lies in a box, or goes on behind it as far as the sky. Auto is bounded where
     pictures have alpha; otherwise it is unbounded if views agree on places outside of the box."""
 
@@ -86,17 +96,17 @@ class HyperspectralDataManagerConfig(DataManagerConfig):
     """How a scene of spectral images is read and sampled."""
 
     _target: Target = "unmix_plugin.datamanager:HyperspectralDataManager"
-    train_num_rays_per_batch: Ours[int] = 2048
+    train_num_rays_per_batch: Unlisted[int] = 2048
     """Rays of the first training step; the model adapts the number to its budget of samples."""
     scene: SceneOptions = SceneOptions()
     """How the files are read and split."""
     subpixels: int | Auto = "auto"
     """Rays cast through a pixel, along each of its edges; their mean is the pixel, in training and in rendering. Auto
     is 2, but 1 where the training views have more than 4 million pixels: more pixels teach more than exact ones."""
-    single_ray_until: Ours[float | Auto] = "auto"
+    single_ray_until: Unlisted[float | Auto] = "auto"
     """Part of the training in which a pixel has a single ray: coarse shape needs many pixels, not exact ones. Auto is
     0.4 with alpha or before a backdrop, otherwise 0.8."""
-    grid_resolution: Ours[int] = 128
+    grid_resolution: Unlisted[int] = 128
     """Cells along an edge of the occupancy grid, from which space is carved that the views show to be empty."""
     trust_alpha: bool = False
     """Believe alpha even where the light of a pixel contradicts it."""
@@ -129,21 +139,21 @@ class HyperspectralDataManagerConfig(DataManagerConfig):
 class UnmixFieldConfig:
     """Sizes of the field's grid and networks."""
 
-    num_levels: Ours[int] = 8
+    num_levels: Unlisted[int] = 8
     """Levels of the hash grid."""
-    features_per_level: Ours[int] = 4
+    features_per_level: Unlisted[int] = 4
     """Features that the hash grid holds at each vertex of a level."""
-    coarsest_resolution: Ours[int] = 16
+    coarsest_resolution: Unlisted[int] = 16
     """Cells along an edge of the scene box on the coarsest level."""
-    finest_resolution: Ours[int | Auto] = "auto"
+    finest_resolution: Unlisted[int | Auto] = "auto"
     """The same on the finest level. Auto follows from `cells_per_pixel`."""
-    cells_per_pixel: Annotated[float, AtStart] = 1.7
+    cells_per_pixel: Annotated[float, AtStartOnly] = 1.7
     """Cells of the finest level along the edge of a pixel where it meets the middle of the scene box: finer ones would
     fit what the views don't show."""
-    log2_rows_per_level: Ours[int | Auto] = "auto"
+    log2_rows_per_level: Unlisted[int | Auto] = "auto"
     """Largest number of vertices that a level stores, as a power of two; finer levels share rows by a hash. auto: from
     16 to 19, about a third of the finest level's cells in a face of the scene box."""
-    hidden_width: Ours[int] = 64
+    hidden_width: Unlisted[int] = 64
     """Width of the hidden layers."""
     temperature: float = 1.0
     """T of the abundances' softmax: lower is purer."""
@@ -187,19 +197,19 @@ class UnmixFieldConfig:
 class RendererConfig:
     """How finely rays are sampled and what is left out."""
 
-    samples_per_pixel: Annotated[float | Auto, AtStart] = "auto"
+    samples_per_pixel: Annotated[float | Auto, AtStartOnly] = "auto"
     """Samples of a ray along the length of a pixel's edge where it meets the middle of the scene box. Auto is 1.5, but
     1 where neither alpha nor a backdrop is known, or the box is more than 300 pixels long: more rays teach more."""
-    coarse_samples: Annotated[Ours[int | Auto], AtStart] = "auto"
+    coarse_samples: Annotated[Unlisted[int | Auto], AtStartOnly] = "auto"
     """Samples along the longest edge of the scene box at the start of training, if there are more in the end: what is
     coarse must be found first, by many rays of few samples. Auto is 256, but 64 in an unbounded world, where rays go
     on outside the box."""
-    smallest_weight: Ours[float | Auto] = "auto"
+    smallest_weight: Unlisted[float | Auto] = "auto"
     """Samples that contribute less than this share of their ray's light are left out. Auto is 0.004."""
-    first_smallest_weight: Ours[float | Auto] = "auto"
+    first_smallest_weight: Unlisted[float | Auto] = "auto"
     """The same at the start of training. Auto is 0.001 where `smallest_weight` is auto and neither alpha nor a backdrop
     is known, else `smallest_weight`."""
-    visible_weight: Ours[float | Auto] = "auto"
+    visible_weight: Unlisted[float | Auto] = "auto"
     """Share of its ray's light from which a sample counts as seen. Cells that no two training views have lately seen
     are left out; 1 leaves none out. Auto is 0.05 with alpha or before a backdrop, else 1."""
 
@@ -247,7 +257,7 @@ class LossConfig:
     background: Literal["random", "black", "white", "last"] | Auto = "auto"
     """What lies behind the scene in training: a random grey a ray, black, white, or the colour of the last sample. Auto
     is random where alpha is known, otherwise black."""
-    spectral: Ours[float] = 1.0
+    spectral: Unlisted[float] = 1.0
     """Weight of the mean squared error of spectra."""
     rgb: float | Auto = "auto"
     """Weight of the mean squared error of their sRGB colours, in which dark pixels count more. Auto is 0.2 with
@@ -258,10 +268,10 @@ class LossConfig:
     abundances: float = 0.1
     """Weight of the mean squared distance of composited abundances to those of the measured spectra, unmixed one by
     one with the first endmembers; 0 as published. It falls to a tenth of that at the end of training."""
-    exposure: Annotated[Ours[float | Auto], AtStart] = "auto"
+    exposure: Annotated[Unlisted[float | Auto], AtStartOnly] = "auto"
     """Factor on spectra, rendered and measured, before they are compared: errors of dark scenes count as much as those
     of bright ones. Auto makes the median opaque pixel as bright as 0.2, but darkens nothing."""
-    relative: Ours[float | Auto] = "auto"
+    relative: Unlisted[float | Auto] = "auto"
     """Power of a pixel's brightness by which squared errors of its spectrum are divided: 0 for absolute errors, 2 for
     relative ones. Auto is 0 unless alpha is known and the brighter pixels are much brighter than the others."""
 
@@ -287,12 +297,12 @@ class PoseConfig:
 
     lens: Literal["fixed", "focal", "radial"] = "fixed"
     """What of the lens that all views share is refined too: nothing, its focal length, or also k1 and k2."""
-    coarse_until: Ours[float] = 0.3
+    coarse_until: Unlisted[float] = 0.3
     """Part of the training in which the levels of the field's grid join, the coarsest first: what is fine draws poses
     to the nearest likeness. Where pictures have alpha, space is carved at its end."""
-    coarse_steps: Ours[int] = 900
+    coarse_steps: Unlisted[int] = 900
     """Steps in which they join at most: what is coarse hardly holds poses, and they drift."""
-    start: Ours[float] = 0.1
+    start: Unlisted[float] = 0.1
     """Part of the coarse part before which poses stay: the field must show something first."""
 
 
@@ -301,32 +311,32 @@ class UnmixModelConfig(ModelConfig):
     """Settings of the model of UnMix-NeRF."""
 
     _target: Target = "unmix_plugin.model:UnmixModel"
-    num_endmembers: Annotated[int | Auto | None, Common, short("endmembers")] = None
+    num_endmembers: Annotated[int | Auto | None, CommonFlag, short_flag("endmembers")] = None
     """K, the number of materials to unmix into; auto proposes it from the training pixels. None is 6, or the number of
     bands if that is smaller."""
-    endmember_init: Annotated[EndmemberInit, Common, AtStart, short("endmember-init")] = "pairs"
+    endmember_init: Annotated[EndmemberInit, CommonFlag, AtStartOnly, short_flag("endmember-init")] = "pairs"
     """First guess of the endmembers from the pixels of all training views, or spectra from `endmember_file`."""
-    endmember_file: Annotated[Path | None, Common, AtStart, short("endmember-file")] = None
+    endmember_file: Annotated[Path | None, CommonFlag, AtStartOnly, short_flag("endmember-file")] = None
     """CSV of reflectances (wavelength,name,...) for `endmember_init` file; multiplied by the scene's light if known,
     and by one factor for the scene's brightness."""
     specular: Literal["none", "dictionary", "full"] = "dictionary"
     """View-dependent part: none, multiples of a few spectra, or one value a band as published."""
-    num_specular_spectra: Ours[int | Auto] = "auto"
+    num_specular_spectra: Unlisted[int | Auto] = "auto"
     """Spectra of the specular dictionary. The first is the light's, a highlight's colour on anything but metal; then
     come the endmembers', as light that they send on has. Auto is 1 with alpha or before a
     backdrop, else all."""
     train_endmembers: bool = True
     """Whether endmembers change while training; else they stay the first guess, or the spectra from a file."""
-    light: Annotated[Light | Auto, Common, short("light")] = "auto"
+    light: Annotated[Light | Auto, CommonFlag, short_flag("light")] = "auto"
     """Light that is fixed, that moves with the camera (objects turned before camera and lamp), or that differs from
     view to view (also exposure). Auto finds which it is; without alpha only whether
     exposures differ."""
-    lamp: Annotated[tuple[float, ...] | Auto, AtStart] = "auto"
+    lamp: Annotated[tuple[float, ...] | Auto, AtStartOnly] = "auto"
     """Where the lamp stands that moves with the camera, when training starts: 0 if it turns with the turntable or 1 if
     it also goes up and down with the camera, the turntable's middle and axis, and the way from the middle to the lamp
     (right, up, towards the camera), in model space; numbers need light `camera`. Auto finds it where light is `auto`
     too; no numbers: not known, so shading is a smooth function of direction and shadows that move are blurred."""
-    poses: Annotated[Literal["fixed", "refine"], Common, short("poses")] = "fixed"
+    poses: Annotated[Literal["fixed", "refine"], CommonFlag, short_flag("poses")] = "fixed"
     """Whether training takes the poses as they are, or corrects them with the field."""
     pose_refinement: PoseConfig = PoseConfig()
     """How poses are corrected."""
@@ -335,10 +345,10 @@ class UnmixModelConfig(ModelConfig):
     samples_per_step: int | Auto = "auto"
     """Samples of rays that a training step looks at; the number of rays adapts to it. Auto is 25,000 on a CPU and
     400,000 on a GPU, which takes no longer for them."""
-    initial_opacity: Annotated[Ours[float | Auto], AtStart] = "auto"
+    initial_opacity: Annotated[Unlisted[float | Auto], AtStartOnly] = "auto"
     """Opacity of one sample's interval in the untrained field. Auto is 0.05 with alpha or before a backdrop, else
     0.01: space between cameras and walls must stay clear."""
-    as_published: Ours[bool] = False
+    as_published: Unlisted[bool] = False
     """Whether the field is that of the method's authors, and losses compare spectra alone."""
     field: UnmixFieldConfig = UnmixFieldConfig()
     """Sizes of the field."""

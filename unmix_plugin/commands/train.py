@@ -17,7 +17,7 @@ import tyro
 
 from unmix_plugin.commands.entry import INTERRUPTED, run_command
 from unmix_plugin.commands.training import finish, first_config, prepare, with_limits_given
-from unmix_plugin.engine.configs import Common, Hidden, TrainerConfig
+from unmix_plugin.engine.configs import CommonFlag, TrainerConfig, UnlistedFlag
 from unmix_plugin.engine.printing import tell
 from unmix_plugin.engine.registry import MethodSpecification, discover_methods, find_method
 from unmix_plugin.errors import ConfigError
@@ -64,10 +64,10 @@ def parse(argv: Sequence[str]) -> tuple[TrainerConfig, TrainingViewerOptions]:
     method = find_method(name)
     explains = f" {_EXPLAIN} prints all decisions and trains nothing."
     if "--help-all" in options:
-        _parse(method, method.config, ["--help"], lambda marks: Hidden not in marks, explains)
+        _parse(method, method.config, ["--help"], lambda marks: UnlistedFlag not in marks, explains)
     if {"--help", "-h"} & set(options):
         ending = f" --help-all lists all options, also those of the viewer;{explains}"
-        _parse(method, method.config, ["--help"], lambda marks: Common in marks, ending)
+        _parse(method, method.config, ["--help"], lambda marks: CommonFlag in marks, ending)
     given = tyro.cli(
         _Given, args=options, prog=f"{_PROGRAM} {name}", return_unknown_args=True, add_help=False
     )[0]

@@ -10,8 +10,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from unmix_plugin.engine.configs import AtStart as AtStart
-    from unmix_plugin.engine.configs import Common as Common
+    from unmix_plugin.engine.configs import AtStartOnly as AtStartOnly
+    from unmix_plugin.engine.configs import CommonFlag as CommonFlag
     from unmix_plugin.engine.configs import DataManagerConfig as DataManagerConfig
     from unmix_plugin.engine.configs import InstantiateConfig as InstantiateConfig
     from unmix_plugin.engine.configs import ModelConfig as ModelConfig
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from unmix_plugin.engine.configs import PipelineConfig as PipelineConfig
     from unmix_plugin.engine.configs import Target as Target
     from unmix_plugin.engine.configs import TrainerConfig as TrainerConfig
-    from unmix_plugin.engine.configs import short as short
+    from unmix_plugin.engine.configs import short_flag as short_flag
     from unmix_plugin.engine.geometry.camera_paths import nearest_to_axes as nearest_to_axes
     from unmix_plugin.engine.geometry.camera_paths import upright_cameras as upright_cameras
     from unmix_plugin.engine.geometry.cameras import Cameras as Cameras
@@ -47,8 +47,8 @@ if TYPE_CHECKING:
 
 _MODULES = {
     "configs": (
-        "AtStart",
-        "Common",
+        "AtStartOnly",
+        "CommonFlag",
         "DataManagerConfig",
         "InstantiateConfig",
         "ModelConfig",
@@ -56,7 +56,7 @@ _MODULES = {
         "PipelineConfig",
         "Target",
         "TrainerConfig",
-        "short",
+        "short_flag",
     ),
     "geometry.camera_paths": ("nearest_to_axes", "upright_cameras"),
     "geometry.cameras": ("Cameras",),

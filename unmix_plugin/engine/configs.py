@@ -27,17 +27,18 @@ Target = tyro.conf.Suppress[type | str]
 """Annotation of `_target`: the class that a config sets up, or where it is, "package.module:Class", which is imported
 when it is needed. Neither shown on the command line nor written to a file."""
 
-Common = "common"
-"""Annotation of a setting that most people need: `Annotated[int, Common, short("name")]`; --help shows only these."""
+CommonFlag = "common"
+"""Annotation of a setting that most people need: `Annotated[int, CommonFlag, short_flag("name")]`; --help shows only
+these."""
 
-Hidden = "hidden"
-"""Annotation of a setting that works as a flag, but that no help lists: `Annotated[int, Hidden]`."""
+UnlistedFlag = "hidden"
+"""Annotation of a setting that works as a flag, but that no help lists: `Annotated[int, UnlistedFlag]`."""
 
-AtStart = "at start"
+AtStartOnly = "at start"
 """Annotation of a setting that acts when a run is started, never again: going on with it refuses another value."""
 
 
-def short(name: str) -> Any:
+def short_flag(name: str) -> Any:
     """Annotation that gives a setting the flag `--name` beside its long one."""
     return tyro.conf.arg(aliases=(f"--{name}",))
 
@@ -177,17 +178,17 @@ class TrainerConfig:
 
     method_name: tyro.conf.Suppress[str] = "unnamed"
     """Name under which the method is registered."""
-    data: Annotated[Path | None, Common] = None
+    data: Annotated[Path | None, CommonFlag] = None
     """The scene's folder."""
-    output_dir: Annotated[Path, Common, AtStart] = Path("outputs")
+    output_dir: Annotated[Path, CommonFlag, AtStartOnly] = Path("outputs")
     """Folder under which the run's own folder is made."""
-    max_num_iterations: Annotated[int | None, Common] = 20_000
+    max_num_iterations: Annotated[int | None, CommonFlag] = 20_000
     """Training ends after so many steps (None: no such limit)."""
-    max_seconds: Annotated[float | None, Common] = None
+    max_seconds: Annotated[float | None, CommonFlag] = None
     """Training ends after so many seconds of training; reading, compiling, evaluating and saving not counted."""
-    seed: Annotated[int, Common] = 42
+    seed: Annotated[int, CommonFlag] = 42
     """Everything random follows from this."""
-    device: Annotated[DeviceName, Common] = "auto"
+    device: Annotated[DeviceName, CommonFlag] = "auto"
     """Where to compute; auto takes CUDA where there is one."""
     steps_per_save: int = 1000
     """Save a checkpoint every so many steps; 0: only at the end."""
@@ -200,7 +201,7 @@ class TrainerConfig:
     average_decay: tyro.conf.Suppress[float | None] = None
     """Decay a step of the moving average of the parameters with which the run is evaluated and rendered; early in
     training it decays faster, to span at most about a ninth of the steps so far. None: no average."""
-    load_run: Annotated[Path | None, Common] = None
+    load_run: Annotated[Path | None, CommonFlag] = None
     """Run folder to continue instead of starting a new one."""
     machine: MachineConfig = MachineConfig()
     """Devices and processes."""
@@ -255,7 +256,7 @@ class Setting:
     """Names of the fields that lead to it."""
     value: Any
     marks: tuple[Any, ...]
-    """Annotations of its field, such as `AtStart` and `short`."""
+    """Annotations of its field, such as `AtStartOnly` and `short_flag`."""
 
     @property
     def flag(self) -> str:
@@ -276,10 +277,10 @@ def settings_of(config: Any, path: tuple[str, ...] = ()) -> Iterator[Setting]:
 
 def refuse_changes_at_start(before: Any, now: Any) -> None:
     """Compare the settings of a run with those to go on with. Raises ConfigError: one differs that is annotated with
-    `AtStart`, and would be written down without having acted."""
+    `AtStartOnly`, and would be written down without having acted."""
     old = {setting.path: setting.value for setting in settings_of(before)}
     for setting in settings_of(now):
-        if AtStart in setting.marks and old.get(setting.path) != setting.value:
+        if AtStartOnly in setting.marks and old.get(setting.path) != setting.value:
             raise ConfigError(
                 f"{setting.flag} is {setting.value}, and the run to go on with was started with "
                 f"{old.get(setting.path)}: it acts when a run is started alone; leave it out, or start a new run"

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from unmix_plugin.engine import (
     Cameras,
-    Common,
+    CommonFlag,
     DataManager,
     DataManagerConfig,
     RayBundle,
@@ -63,7 +63,7 @@ class ObjectDataManagerConfig(DataManagerConfig):
     """Pixels of a training step, drawn from all training views where they show the mesh."""
     max_pixels: int = 8_000_000
     """Training pixels kept in memory; of more, these are drawn evenly."""
-    lamp: Annotated[str | None, Common] = None
+    lamp: Annotated[str | None, CommonFlag] = None
     """For pictures of many bands: spectrum of the light, a .csv (wavelength,power), an ENVI spectral library or a name
     (D65, A, ...); None takes 'illuminant_path' of transforms.json."""
 

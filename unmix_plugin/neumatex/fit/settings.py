@@ -11,7 +11,7 @@ import numpy as np
 import torch
 import tyro
 
-from unmix_plugin.engine import AtStart, Common, ModelConfig, Target, config_from_json, short
+from unmix_plugin.engine import AtStartOnly, CommonFlag, ModelConfig, Target, config_from_json, short_flag
 from unmix_plugin.errors import Check, require
 from unmix_plugin.neumatex.fit.tone import LightCurve, ToneMapping
 from unmix_plugin.spectral.bands import Bands
@@ -107,27 +107,27 @@ class NeumatexModelConfig(ModelConfig):
     _target: Target = "unmix_plugin.neumatex.fit.model:NeumatexModel"
     eval_num_rays_per_chunk: tyro.conf.Suppress[int | Auto] = "auto"
     """No flag: pictures are traced in parts of a size of their own."""
-    material: Annotated[MaterialName, Common] = "neural"
+    material: Annotated[MaterialName, CommonFlag] = "neural"
     """Family of materials: neural (base colour and latents of a shared decoder), pbr (base colour, roughness,
     metallicity), or for pictures of many bands spectral (a mixture of endmember reflectances under a grey gloss)."""
-    num_endmembers: Annotated[int | Auto | None, Common, short("endmembers")] = None
+    num_endmembers: Annotated[int | Auto | None, CommonFlag, short_flag("endmembers")] = None
     """Of spectral materials: K, how many reflectances are mixed; auto proposes it from the training pixels. None is the
     number of --pipeline.model.from-run, otherwise 6, or the number of bands if that is smaller."""
-    endmember_init: Annotated[EndmemberMethod, AtStart] = "pairs"
+    endmember_init: Annotated[EndmemberMethod, AtStartOnly] = "pairs"
     """Of spectral materials: first guess of the endmembers, from the pixels divided by the light that reaches them."""
-    from_run: Annotated[Path | None, Common, AtStart] = None
+    from_run: Annotated[Path | None, CommonFlag, AtStartOnly] = None
     """Of spectral materials: run of unmix-nerf whose endmembers and abundances the fit starts from."""
-    samples: Annotated[int, Common] = 16
+    samples: Annotated[int, CommonFlag] = 16
     """Paths a pixel in training, in two independent halves; more is slower and less noisy. Few leave a bias, since tone
     curves bend: at equal time, 16 in half as many pixels did better than 8, and 4 in twice as many worse."""
-    bounces: Annotated[int, Common] = 1
+    bounces: Annotated[int, CommonFlag] = 1
     """How often light may be reflected between parts of the object before it reaches the point that is seen."""
-    render_samples: Annotated[int, Common] = 64
+    render_samples: Annotated[int, CommonFlag] = 64
     """Paths a pixel in renders and in the viewer."""
-    eval_samples: Annotated[int, Common] = 256
+    eval_samples: Annotated[int, CommonFlag] = 256
     """Paths a pixel in evaluation, where noise would count as an error of the material: with 64 a good fit measures
     1.4 dB worse than it is, with 256 0.2 dB."""
-    prior: Annotated[PriorName, Common] = "small"
+    prior: Annotated[PriorName, CommonFlag] = "small"
     """Where the fit starts and what it is held to: small is the prior of the package; none starts from a plain grey
     material. Spectral materials have no prior: they start from the pictures or from a run."""
     fit_networks: bool = True
