@@ -176,7 +176,7 @@ class HyperspectralDataManager(DataManager):
         """`pixels`: spectra pooled over all training views; `reachable`: where something may be; `knots`: where cameras
         stand whose poses may be corrected; `light`: fixed, camera or per-view, as far as pictures with alpha tell;
         `lamp`: numbers of the lamp that moves with the camera, none if it is not known;
-        `exposure`, the factor that makes matter as bright as errors are meant for;
+        `exposure`, the factor that makes the foreground as bright as errors are meant for;
         `band_weights`, of squared errors, mean 1; `relative`, the power of brightness by which these are divided.
 
         Of a rig, pixels of the sensor with most channels, and of those the one with most pixels; `sensor`, which that
@@ -250,7 +250,7 @@ class HyperspectralDataManager(DataManager):
         if self.scene.has_backdrop:
             found.append(
                 "pictures have no alpha, but share a plain backdrop: it is learnt as what lies behind the scene, and "
-                "no matter is sought where they show it (--world bounded or unbounded does without)"
+                "nothing is sought where they show it (--world bounded or unbounded does without)"
             )
         found += rig_warnings(self.scene, self._initial_data["reachable"]) if self._is_rig else []
         return [warning for warning in found if warning is not None]

@@ -101,8 +101,8 @@ class Check:
         names = (self.fields,) if isinstance(self.fields, str) else self.fields
         rule = f"{_flag(names[0])} {self.rule}" if isinstance(self.fields, str) else self.rule
         values = [(_flag(name), getattr(settings, name)) for name in names]
-        told = [(name, "none" if value is None else value) for name, value in values]
-        shown = [str(value) if len(told) == 1 else f"{name} {value}" for name, value in told]
+        named = [(name, "none" if value is None else value) for name, value in values]
+        shown = [str(value) if len(named) == 1 else f"{name} {value}" for name, value in named]
         return f"{rule} (got {', '.join(shown)})" if shown else rule
 
 

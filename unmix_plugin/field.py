@@ -89,7 +89,7 @@ class CoefficientField(Field):
         """Abundances a of points with these geometry features, summing to 1."""
 
     def sky(self, rays: RayBundle) -> Float[Tensor, "R C"] | None:
-        """What is behind all matter: K abundances, and the brightness they are multiplied with; None if nothing."""
+        """What is behind all that is rendered: K abundances, and what they are multiplied with; None if nothing."""
         return None
 
     def get_density(self, positions: Float[Tensor, "S 3"]) -> tuple[Float[Tensor, "S"], Float[Tensor, "S G"]]:

@@ -137,17 +137,17 @@ def _libraries_in_short() -> Iterator[None]:
     helps itself, and one line of all letters that its font lacks.
     """
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
-    usual, is_said = warnings.showwarning, False
+    usual, is_warned = warnings.showwarning, False
 
     def show(message: Warning | str, *where: Any, **more: Any) -> None:
-        nonlocal is_said
+        nonlocal is_warned
         lacking = re.match(r"Glyph (\d+) .*missing from", str(message))
         if isinstance(message, UnmixWarning):
             _say(f"warning: {message}")
         elif lacking is None:
             usual(terminal_text(str(message)), *where, **more)
-        elif not is_said:
-            is_said, letter = True, chr(int(lacking[1]))
+        elif not is_warned:
+            is_warned, letter = True, chr(int(lacking[1]))
             _say(
                 f"warning: figures have boxes in place of letters such as {letter}, which their font lacks; other "
                 "files have them. Rename materials or views if that matters",

@@ -90,9 +90,9 @@ def _compare(console: Console, runs: list[ComparedRun]) -> None:
     for label in found.labels:
         table.add_column(label, justify="right", overflow="fold")
     for name, values in found.rows:
-        told = [f"{one:.4g}" if isinstance(one, float) else shown(one) or "-" for one in values]
+        texts = [f"{one:.4g}" if isinstance(one, float) else shown(one) or "-" for one in values]
         more = [f" ({difference(one, values[0])})" if one != values[0] else "" for one in values]
-        table.add_row(name, *(one + by.replace(" ()", "") for one, by in zip(told, more, strict=True)))
+        table.add_row(name, *(one + by.replace(" ()", "") for one, by in zip(texts, more, strict=True)))
     console.print(table)
     for remark in found.remarks:
         say(console, remark)

@@ -1,6 +1,6 @@
 """A training from its settings to its run: what `unmix-train` and `unmix_plugin.train` share.
 
-After training the course of the loss is told in words: whether it settled, and what to try where it did not.
+After training the course of the loss is put into words: whether it settled, and what to try where it did not.
 """
 
 from __future__ import annotations
@@ -201,8 +201,8 @@ stay below 0.35, also short ones."""
 _STILL_FALLS = 0.3
 """Share by which the loss fell from the third to the last quarter, above which more steps are worthwhile."""
 
-_LITTLE_MATTER = 0.02
-"""Share of light from matter below which a world has nothing but a sky."""
+_LITTLE_FOREGROUND = 0.02
+"""Part of light from anything but the sky below which a world has nothing else."""
 _FEW_PASSES = 3
 """Rays for each training pixel below which fine detail is still being learnt."""
 
@@ -231,11 +231,11 @@ def _remarks(metrics_path: Path) -> list[str]:
             f"{outliers:.0%} of the views, or of the rows of line cameras, still fit far worse than the others and "
             "hardly shape the scene: their poses are off, or they show something else"
         )
-    matter = known[-1].get("matter_share")
-    if matter is not None and matter < _LITTLE_MATTER:
+    foreground = known[-1].get("matter_share")
+    if foreground is not None and foreground < _LITTLE_FOREGROUND:
         found.append(
-            f"{1 - matter:.0%} of what the views show was learnt as sky: they agree on nothing nearer. If they show a "
-            "scene, look whether poses belong to their pictures, or train with --world bounded"
+            f"{1 - foreground:.0%} of what the views show was learnt as sky: they agree on nothing nearer. If they "
+            "show a scene, look whether poses belong to their pictures, or train with --world bounded"
         )
     if last > _HARDLY_FELL * first:
         found.append(

@@ -59,9 +59,9 @@ class Pipeline(nn.Module):
         self.decisions = [*self.datamanager.decisions(), *self.decisions]
         self.warn(*self.datamanager.warnings(), *self.model.warnings())
 
-    def warn(self, *said: str) -> None:
+    def warn(self, *warnings: str) -> None:
         """Let warnings join `reasons`, a line each."""
-        self.reasons = "\n".join(filter(None, [self.reasons, *(f"warning: {one}" for one in said)]))
+        self.reasons = "\n".join(filter(None, [self.reasons, *(f"warning: {one}" for one in warnings)]))
 
     def draw_as(self, rank: int) -> None:
         """Draw the rays of process number `rank` from now on; those of the first are the ones of a single process."""

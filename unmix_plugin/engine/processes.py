@@ -97,8 +97,8 @@ class Processes:
         """What the first process says: the progress of the step to take now, or None if training is over."""
         if self.count == 1:
             return progress
-        told = [-1.0 if progress is None else progress]
-        order = torch.tensor(told, dtype=torch.float64, device=_device_of_exchanges())
+        sent = [-1.0 if progress is None else progress]
+        order = torch.tensor(sent, dtype=torch.float64, device=_device_of_exchanges())
         found = float(self.of_first(order))
         return None if found < 0 else found
 
@@ -142,15 +142,15 @@ class Processes:
             failure, described = error, str(error)
             if not isinstance(error, UnmixError):
                 described = traceback.format_exception_only(error)[-1].strip()
-        said = self.gather(described)
-        failed = [rank for rank, text in enumerate(said) if text is not None]
+        messages = self.gather(described)
+        failed = [rank for rank, text in enumerate(messages) if text is not None]
         if not failed:
             return
         if not self.is_first:
             raise Follower(2)
         if failure is not None:
             raise failure
-        raise RunError(f"process {failed[0] + 1} of {self.count}: {said[failed[0]]}")
+        raise RunError(f"process {failed[0] + 1} of {self.count}: {messages[failed[0]]}")
 
     def _exchange(self, operation: Callable[..., Any], *values: Any, **options: Any) -> None:
         """An exchange with the others, which Python's handlers of signals interrupt; a RunError if one of them is
@@ -376,13 +376,13 @@ def _answers(place: _Place) -> bool:
 def _wait_until(is_so: Callable[[], bool], deadline: float, what: str, place: _Place) -> None:
     """Look again and again, which signals interrupt; the first process of a machine says what it waits for. Raises
     RunError: it is past the deadline."""
-    begun, is_said = time.monotonic(), False
+    started, is_announced = time.monotonic(), False
     while not is_so():
         now = time.monotonic()
         if now > deadline:
             raise RunError(f"waited {_MEETING_S / 60:.0f} minutes for {what}; have all of them been started?")
-        if not is_said and now - begun > _SILENT_S and place.local_rank == 0:
-            is_said = True
+        if not is_announced and now - started > _SILENT_S and place.local_rank == 0:
+            is_announced = True
             _tell(f"waiting for {what}, at most {_MEETING_S / 60:.0f} minutes ...")
         time.sleep(0.05)
 

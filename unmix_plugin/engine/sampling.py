@@ -1,4 +1,4 @@
-"""Which of many are looked at."""
+"""Evenly spaced picks of many."""
 
 from __future__ import annotations
 

@@ -170,10 +170,10 @@ def _parts(recorded: Any, size: int, part: int, values: Sequence[Any]) -> list[A
 def _run(commands: Sequence[Any], threads: int) -> None:
     """Run packed launches on this thread and on others that have nothing else to do."""
     # One iterator for all threads, whose steps the interpreter doesn't interrupt: each command is taken once.
-    waiting = iter(commands)
+    remaining = iter(commands)
 
     def work() -> None:
-        for command in waiting:
+        for command in remaining:
             command.launch()
 
     num_helpers = min(threads, len(commands)) - 1

@@ -200,7 +200,7 @@ class Cameras:
         rows: Tensor | None = None
         if self.key_poses is not None and self.is_line_camera(index):
             rows, local = project_by_row(points, self.key_poses.of(index), self.size(index)[1])
-            local = local * local.new_tensor([1.0, 0.0, 1.0])  # each row is looked at along its own axis
+            local = local * local.new_tensor([1.0, 0.0, 1.0])  # each row is seen along an axis of its own
         else:
             pose = self.camera_to_world[index]
             local = (points - pose[:, 3]) @ pose[:, :3]
@@ -288,18 +288,18 @@ def _fold_radius(coefficients: Float[Tensor, " D"]) -> float:
 
 
 def undistort(
-    bent: Float[Tensor, "*points 2"], coefficients: Float[Tensor, "*#points D"]
+    distorted: Float[Tensor, "*points 2"], coefficients: Float[Tensor, "*#points D"]
 ) -> Float[Tensor, "*points 2"]:
-    """Invert `distort` by Newton's method, started at the bent point itself.
+    """Invert `distort` by Newton's method, started at the distorted point itself.
 
     Exact to rounding where the lens model is invertible along the way, as it is for every lens whose image does not
     fold over; where its Jacobian vanishes the step is left out.
     """
     p1, p2 = coefficients[..., 2], coefficients[..., 3]
-    coords = bent
+    coords = distorted
     for _ in range(_NEWTON_STEPS):
         x, y = coords.unbind(-1)
-        error_x, error_y = (distort(coords, coefficients) - bent).unbind(-1)
+        error_x, error_y = (distort(coords, coefficients) - distorted).unbind(-1)
         r2 = x * x + y * y
         radial, slope = _radial(r2, coefficients)
         dxx = radial + 2.0 * x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x

@@ -172,12 +172,12 @@ def _first_stripes(
         (poses[:, :, axis], (poses[:, :, 3] * poses[:, :, axis]).sum(dim=1, keepdim=True)) for axis in (1, 2)
     )
     count = len(poses) - 1
-    left = torch.arange(count, 0, -1, dtype=torch.int16, device=points.device)[:, None]
+    ranks = torch.arange(count, 0, -1, dtype=torch.int16, device=points.device)[:, None]
     for first in range(0, len(points), _CHUNK):
         chosen = points[first : first + _CHUNK].T.contiguous()
         is_above, is_before = up[0] @ chosen > up[1], back[0] @ chosen < back[1]
         passes = (is_above[1:] ^ is_above[:-1]) & is_before[1:] & is_before[:-1]
-        stripes[first : first + _CHUNK] = count - (passes * left).amax(dim=0).long()
+        stripes[first : first + _CHUNK] = count - (passes * ranks).amax(dim=0).long()
     return stripes.clamp(max=count - 1), stripes < count
 
 

@@ -104,10 +104,10 @@ def _newest_checkpoint(run: RunFolder) -> Checkpoint:
     """The newest complete checkpoint, with a warning where it isn't the newest."""
     found = newest_complete_checkpoint(run.checkpoints)
     if found.damaged:
-        said = (
+        message = (
             f"{run.path} is shown as it was after step {found.step}: passed over {'; '.join(found.damaged)}"
         )
-        warnings.warn(said, UnmixWarning, stacklevel=3)
+        warnings.warn(message, UnmixWarning, stacklevel=3)
     return found
 
 

@@ -64,11 +64,11 @@ class TrainingStatus:
     def fitted(self, width: int) -> str:
         """The status in at most `width` characters, where dropping all but step, percentage and time left will do."""
         psnr = "" if self.psnr is None else f"  psnr {self.psnr:.2f} dB"
-        left = "" if self.seconds_left is None else f"  {_clock(self.seconds_left)} left"
+        remaining = "" if self.seconds_left is None else f"  {_clock(self.seconds_left)} left"
         speed, loss = f"  {_count(self.rays_per_second)} rays/s", f"  loss {self.loss:.3g}"
         text = ""
         for parts in ((loss, psnr, speed), (loss, psnr), (psnr,), ()):
-            text = f"step {self.step}  {100 * self.progress:3.0f} %{''.join(parts)}{left}"
+            text = f"step {self.step}  {100 * self.progress:3.0f} %{''.join(parts)}{remaining}"
             if len(text) <= width:
                 break
         return text

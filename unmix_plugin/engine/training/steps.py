@@ -77,14 +77,14 @@ class TrainingSteps:
                 "checkpoint: make them attributes, or entries of an nn.ParameterList"
             )
         trained = {id(param) for own in groups.values() for param in own}
-        left = {
+        untrained = {
             name
             for name, param in pipeline.model.named_parameters()
             if param.requires_grad and param.numel() and id(param) not in trained
         }
-        if left:
+        if untrained:
             pipeline.warn(
-                f"{name_some(sorted(left))} of the model can be trained, but no parameter group has it"
+                f"{name_some(sorted(untrained))} of the model can be trained, but no parameter group has it"
             )
         self.optimizer = build_optimizer(groups, configs)
         self.guard = GradientGuard(self.optimizer)

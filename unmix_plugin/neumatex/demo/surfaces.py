@@ -226,16 +226,16 @@ class SpectralSurface:
         self.family = SpectralFamily(torch.tensor(endmembers, dtype=torch.float32))
         self._regions = [Noise.draw(rng, rng.uniform(1.8, 3.2)) for _ in self.names]
         self._sharpness = float(np.exp(rng.uniform(np.log(4.0), np.log(16.0))))
-        gloss = np.stack(
+        specular = np.stack(
             [rng.uniform(0.25, 0.7, _NUM_MATERIALS), rng.uniform(0.1, 0.3, _NUM_MATERIALS)], axis=1
         )
         self._shifts = self._balanced(positions)
-        self._gloss = torch.tensor(gloss, dtype=torch.float32)
+        self._specular = torch.tensor(specular, dtype=torch.float32)
 
     def parameters(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N P"]:
         """Parameters of `SpectralFamily` at positions of model space."""
         shares = self._shares(positions, self._shifts.to(positions))
-        return torch.cat([shares, shares @ self._gloss.to(shares)], dim=-1)
+        return torch.cat([shares, shares @ self._specular.to(shares)], dim=-1)
 
     def _shares(self, positions: Float[Tensor, "N 3"], shifts: Float[Tensor, " K"]) -> Float[Tensor, "N K"]:
         levels = torch.stack([region.at(positions) for region in self._regions], dim=-1)

@@ -2,7 +2,8 @@
 
 The page has no path tracer. Of light from far away it knows, at each vertex, the share of each spherical harmonic that
 arrives there past the object itself, once reflected on it included (precomputed radiance transfer, Sloan et al. 2002),
-and for gloss each environment blurred to several roughnesses (split sum, Karis 2013). Materials are those of glTF.
+and for specular reflection each environment blurred to several roughnesses (split sum, Karis 2013). Materials are those
+of glTF.
 
 Notation: `V` vertices, `F` faces, `N` rays a vertex, `S` sizes of a table.
 """

@@ -48,12 +48,14 @@ class MaterialProduct(RunProduct):
                 bands=scene.bands,
                 metres_per_unit=None if job.loaded.scale is None else job.loaded.scale.metres_per_unit,
             )
-        said = f"the glTF material differs from the trained one by {100 * error:.1f} % of the reflected light"
+        message = (
+            f"the glTF material differs from the trained one by {100 * error:.1f} % of the reflected light"
+        )
         if error > _FAR_OFF:
-            said += (
+            message += (
                 ": its base colour, roughness and metallicity can't express it. Where that shows, draw it with "
                 "decoder.glsl, or with unmix-render, which traces the trained one"
             )
-        job.say(said)
+        job.say(message)
         say_units(job, "material.glb")
         return written

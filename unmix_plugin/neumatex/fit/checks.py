@@ -104,11 +104,11 @@ def outline_doubts(overlaps: Float64[np.ndarray, " V"], where: str) -> list[str]
     median = float(np.median(overlaps))
     if median >= DOUBTFUL_OVERLAP:
         return []
-    said = (
+    doubt = (
         f"{where} and alpha show different outlines: their overlap is {median:.0%} (median of {len(overlaps)} views; "
         "90% and more is usual), which blurs materials. Check size and place of the mesh, lenses and alpha"
     )
-    return [said]
+    return [doubt]
 
 
 def sides_seen(ray_mesh: RayMesh, cameras: Cameras) -> Float[Tensor, " F"]:
@@ -143,9 +143,9 @@ def light_doubts(pictures: PosedPictures, environment: Environment) -> list[str]
         ratio, what = bright, "95 % of the object's pixels are less than"
     else:
         return []
-    said = (
+    doubt = (
         f"{what} {ratio:.2g} times as bright as the mean of the environment map; {low:g} to {high:g} times is usual. "
         "Pictures and map seem to have different units, and materials come out wrong then. Scale one of them: an "
         f"'environment_exposure_stops' {math.log2(ratio / _USUAL):.0f} higher would be about right"
     )
-    return [said]
+    return [doubt]

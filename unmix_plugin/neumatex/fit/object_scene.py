@@ -347,9 +347,9 @@ def _read_held_out(
     notes: list[str],
 ) -> HeldOutLight:
     """A folder below relit/, given the object's pictures, bands and lamp."""
-    said = list[str]()
-    folder = _read_folder(root, said, needs_mesh=False)
-    notes += [f"relit/{root.name}/{warning}" for warning in said]
+    remarks = list[str]()
+    folder = _read_folder(root, remarks, needs_mesh=False)
+    notes += [f"relit/{root.name}/{warning}" for warning in remarks]
     pictures = folder.pictures(frame)
     if pictures.tone == "camera" != own.tone:
         raise SceneError(

@@ -109,7 +109,8 @@ class NeumatexModelConfig(ModelConfig):
     """No flag: pictures are traced in parts of a size of their own."""
     material: Annotated[MaterialName, CommonFlag] = "neural"
     """Family of materials: neural (base colour and latents of a shared decoder), pbr (base colour, roughness,
-    metallicity), or for pictures of many bands spectral (a mixture of endmember reflectances under a grey gloss)."""
+    metallicity), or for pictures of many bands spectral (a mixture of endmember reflectances under a grey specular
+    layer)."""
     num_endmembers: Annotated[int | Auto | None, CommonFlag, short_flag("endmembers")] = None
     """Of spectral materials: K, how many reflectances are mixed; auto proposes it from the training pixels. None is the
     number of --pipeline.model.from-run, otherwise 6, or the number of bands if that is smaller."""

@@ -36,7 +36,7 @@ from unmix_plugin.trained.open_run import open_run
 from unmix_plugin.trained.surface import look_from_above
 from unmix_plugin.trained.trained_scene import TrainedScene
 
-_PLAIN_GLOSS = (0.5, 0.2)
+_PLAIN_SPECULAR = (0.5, 0.2)
 """Roughness and specular level of a common dielectric, half rough."""
 _START_RANGE = (0.05, 0.95)
 """Of parameters, away from where a sigmoid has no slope."""
@@ -74,7 +74,7 @@ def _plain_parameters(family: MaterialFamily) -> Float[Tensor, "P"]:
         return family.from_layered(layered)[0].clamp(*_START_RANGE)
     if isinstance(family, SpectralFamily):
         shares = torch.full((family.num_endmembers,), 1 / family.num_endmembers)
-        return torch.cat([shares, torch.tensor(_PLAIN_GLOSS)])
+        return torch.cat([shares, torch.tensor(_PLAIN_SPECULAR)])
     return torch.tensor([0.5, 0.5, 0.5, 0.5, 0.0]).clamp(*_START_RANGE)
 
 
@@ -145,13 +145,13 @@ def spectral_start(
 def _apparent_reflectance(
     traced: TracedObject, points: SurfacePoints, radiance: Float[Tensor, "N B"]
 ) -> tuple[Float[Tensor, "N B"], Bool[Tensor, " N"]]:
-    """Reflectance of a diffuse base under the plain gloss that would look so bright in direct light; and where enough
-    light falls for it to mean something."""
-    white, gloss = (_plain_light(traced, points, base) for base in (1.0, 0.0))
-    diffuse = (white - gloss).clamp(min=1e-6)
+    """Reflectance of a diffuse base under the plain specular layer that would look so bright in direct light; and where
+    enough light falls for it to mean something."""
+    white, specular = (_plain_light(traced, points, base) for base in (1.0, 0.0))
+    diffuse = (white - specular).clamp(min=1e-6)
     brightness = diffuse.mean(dim=1)
     is_lit = brightness > _DARKEST * brightness.median()
-    return ((radiance - gloss) / diffuse).clamp(min=0), is_lit
+    return ((radiance - specular) / diffuse).clamp(min=0), is_lit
 
 
 @dataclass(frozen=True)
@@ -161,7 +161,7 @@ class _Plain:
     family: MaterialFamily
 
     def parameters(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N P"]:
-        return positions.new_tensor([1.0, *_PLAIN_GLOSS]).expand(len(positions), -1)
+        return positions.new_tensor([1.0, *_PLAIN_SPECULAR]).expand(len(positions), -1)
 
 
 def _plain_light(traced: TracedObject, points: SurfacePoints, base: float) -> Float[Tensor, "N B"]:

@@ -103,9 +103,15 @@ _SPECTRAL = (
         nothing=255,
         remarks=("255 where nothing is",),
     ),
-    Output("roughness", "map", "roughness", "roughness of the gloss", (0.0, 1.0), remarks=("0 to 1",)),
     Output(
-        "specular_level", "map", "specular level", "root of what the gloss reflects straight on", (0.0, 1.0)
+        "roughness", "map", "roughness", "roughness of the specular layer", (0.0, 1.0), remarks=("0 to 1",)
+    ),
+    Output(
+        "specular_level",
+        "map",
+        "specular level",
+        "root of what the specular layer reflects straight on",
+        (0.0, 1.0),
     ),
 )
 _UNCERTAINTY = Output(

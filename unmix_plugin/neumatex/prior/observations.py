@@ -242,9 +242,9 @@ def _lobe_fits(
     difference = colours - mean_colour[..., None, :, :]
     share = _mean(spread * difference) / (_mean(spread.square()) + _RIDGE)
     constant = (mean_colour - share * mean_light) / (reaching[..., None, :] + 0.02)
-    left = _mean((difference - share[..., None, :, :] * spread).square()).sum(dim=-1, keepdim=True)
-    left = left / (_mean(difference.square()).sum(dim=-1, keepdim=True) + 1e-3)
-    return torch.cat([share.clamp(-1, 2), constant.clamp(-1, 2), left.clamp(0, 2)], dim=-1).flatten(-2)
+    residual = _mean((difference - share[..., None, :, :] * spread).square()).sum(dim=-1, keepdim=True)
+    residual = residual / (_mean(difference.square()).sum(dim=-1, keepdim=True) + 1e-3)
+    return torch.cat([share.clamp(-1, 2), constant.clamp(-1, 2), residual.clamp(0, 2)], dim=-1).flatten(-2)
 
 
 def _compressed(light: Tensor) -> Tensor:

@@ -62,7 +62,7 @@ _MOST_ASKED = 640
 _RATE, _SHRINKAGE = 0.05, 1e-4
 """Of the fit of planes; shrinkage pulls texels that hardly a point reads to 0."""
 _MOST_VIEWS = 12
-"""Views that are looked at; of more, those whose directions are farthest apart."""
+"""Views that are used; of more, those whose directions are farthest apart."""
 _NUM_POINTS, _LEAST_ALPHA = 3072, 0.9
 
 
@@ -152,11 +152,11 @@ class Estimates:
 def fit_loss(readers: Readers, planes: Float[Tensor, "B 3 C R R"], estimates: Estimates) -> Float[Tensor, ""]:
     """How far the planes are from what is said of points: errors count by how sure it is, and log-variances too."""
     features = torch.stack([plane_features(*pair) for pair in zip(planes, estimates.positions, strict=True)])
-    features, said = features.flatten(0, 1), estimates.log_variance.flatten(0, 1)
+    features, log_variance = features.flatten(0, 1), estimates.log_variance.flatten(0, 1)
     error = readers.material(features) - estimates.parameters.flatten(0, 1)
     # Parameters that are known to 0.02 or better count the same: beyond that a few points would decide all.
-    certain = torch.exp(-0.5 * said.clamp(min=-8.0))
-    unsure = readers.log_variance(features) - said
+    certain = torch.exp(-0.5 * log_variance.clamp(min=-8.0))
+    unsure = readers.log_variance(features) - log_variance
     loss = (error.square() * certain).mean() + 0.02 * unsure.square().mean()
     return loss + _SHRINKAGE * planes.square().mean()
 
@@ -203,8 +203,8 @@ def predict(
     with torch.no_grad():
         environment = replace(environment, image=environment.image.cpu())
         observations = _observe(chosen, ray_mesh, environment, generator)
-        said = prior.estimate(prior(observations), material)
-    planes = fit_planes(prior.readers_of(material), Estimates(observations.positions, *said))[0]
+        estimates = prior.estimate(prior(observations), material)
+    planes = fit_planes(prior.readers_of(material), Estimates(observations.positions, *estimates))[0]
     return Triplane.filled(prior.readers_of(material), planes, resolution)
 
 

@@ -149,7 +149,7 @@ class PbrFamily(MaterialFamily):
     def evaluate(self, parameters: Parameters, wi: Directions, wo: Directions) -> Colours:
         base, roughness, metallicity = parameters.T.contiguous().split([3, 1, 1])
         f0 = _DIELECTRIC_F0 + metallicity * (base - _DIELECTRIC_F0)
-        fresnel, facets, masking, above = _gloss(roughness, f0, wi.T.contiguous(), wo.T.contiguous())
+        fresnel, facets, masking, above = _specular(roughness, f0, wi.T.contiguous(), wo.T.contiguous())
         diffuse = (1.0 - fresnel) * ((1.0 - metallicity) / math.pi) * base
         return ((diffuse + fresnel * (facets * masking)) * above).T
 
@@ -165,14 +165,14 @@ class PbrFamily(MaterialFamily):
 
 
 class SpectralFamily(MaterialFamily):
-    """A diffuse base that is a mixture of endmember reflectances, and a grey gloss above it.
+    """A diffuse base that is a mixture of endmember reflectances, and a grey specular layer above it.
 
     Parameters: abundances (0 to K - 1, at least 0, sum 1), roughness (K), specular level (K + 1). With abundances a,
-    endmembers E and the albedo A of the gloss for light from one direction,
+    endmembers E and the albedo A of the layer for light from one direction,
 
-        f = (1 - A(wi)) (1 - A(wo)) / (1 - mean A) (a E) / pi + gloss(wi, wo)
+        f = (1 - A(wi)) (1 - A(wo)) / (1 - mean A) (a E) / pi + specular(wi, wo)
 
-    The gloss is one GGX lobe, the same in all bands. It reflects the square of the specular level at normal incidence:
+    The layer is one GGX lobe, the same in all bands. It reflects the square of the specular level at normal incidence:
     0.2 is a common dielectric's 4 %. What it reflects does not reach the base, so a white base under it reflects all
     light, and no material more than it gets.
     """
@@ -198,7 +198,7 @@ class SpectralFamily(MaterialFamily):
     def evaluate(self, parameters: Parameters, wi: Directions, wo: Directions) -> Colours:
         roughness, f0 = self._roughness_and_f0(parameters)
         wi, wo = wi.T.contiguous(), wo.T.contiguous()
-        fresnel, facets, masking, above = _gloss(roughness, f0, wi, wo)
+        fresnel, facets, masking, above = _specular(roughness, f0, wi, wo)
         a, b = mean_ggx_albedo(roughness)
         passed = _passing(roughness, f0, wi[2]) * _passing(roughness, f0, wo[2]) / (1.0 - (f0 * a + b))
         return (passed * above / math.pi).T * self.base_colour(parameters) + (
@@ -217,7 +217,7 @@ class SpectralFamily(MaterialFamily):
         self.gains.fill_(1)
 
     def _roughness_and_f0(self, parameters: Tensor) -> tuple[Tensor, Tensor]:
-        """Each (1 N); f0 is what the gloss reflects at normal incidence."""
+        """Each (1 N); f0 is what the specular layer reflects at normal incidence."""
         roughness, level = parameters[:, self.num_endmembers :].T.contiguous().split([1, 1])
         return roughness, level * level
 
@@ -228,7 +228,7 @@ class SpectralFamily(MaterialFamily):
         return LobeMixture.of_albedos(alpha_of(roughness), diffuse, 1.0 - passed)
 
 
-def _gloss(
+def _specular(
     roughness: Float[Tensor, "1 N"],
     f0: Float[Tensor, "C N"],
     wi: Float[Tensor, "3 N"],
@@ -243,6 +243,6 @@ def _gloss(
 
 
 def _passing(roughness: Tensor, f0: Tensor, cosine: Float[Tensor, " N"]) -> Float[Tensor, "1 N"]:
-    """Share of light from a direction that the gloss does not reflect."""
+    """Share of light from a direction that the specular layer does not reflect."""
     a, b = ggx_albedo(roughness, cosine.clamp_min(0.0))
     return 1.0 - (f0 * a + b)

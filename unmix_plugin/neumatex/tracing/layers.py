@@ -136,8 +136,8 @@ def _tabulated(rows: Tensor, reflected: Callable[[Tensor, Tensor], Tensor]) -> F
 def _ggx_means(device: torch.device) -> tuple[Tensor, Tensor]:
     """Means of each row, (2, rows), and their rise to the next row."""
     # The integral of 2 mu E(mu), with mu the square of the column, exact for what is linear between columns as look-ups
-    # are: a smooth white gloss passes less light than a coarser rule is wrong by. Differences of the double integral
-    # of 4 s^3 give the weights of columns.
+    # are: a smooth white specular layer passes less light than a coarser rule is wrong by. Differences of the double
+    # integral of 4 s^3 give the weights of columns.
     s = torch.linspace(0.0, 1.0, _COLUMNS, dtype=torch.float64)
     rises = (s**5 / 5).diff() / s.diff()
     weights = torch.cat([s[:1], rises, s[-1:]]).diff()

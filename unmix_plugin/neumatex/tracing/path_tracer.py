@@ -166,17 +166,17 @@ def _shade(
     rows = vertices.front(directions, wi[:, 2]).nonzero()[:, 0]
     vertices, wi, directions = vertices.select(rows), wi[rows], directions[rows]
     hits = world.ray_mesh.closest(vertices.points.positions, directions)
-    if is_last:  # what is met sends no more light
+    if is_last:  # what is hit sends no more light
         rows = (~hits.found).nonzero()[:, 0]
         vertices, wi, directions, hits = vertices.select(rows), wi[rows], directions[rows], hits.select(rows)
-    free, met = (~hits.found).nonzero()[:, 0], hits.found.nonzero()[:, 0]
+    free, hit = (~hits.found).nonzero()[:, 0], hits.found.nonzero()[:, 0]
     reflectance, density = vertices.reflection(wi)
     usable = torch.isfinite(density) & (density > 0)
     carried = vertices.throughput * reflectance * torch.where(usable, wi[:, 2] / density, 0.0)[:, None]
     weight = _power_heuristic(density[free], world.environment.density(directions[free]))
     escaped = carried[free] * (weight[:, None] * world.environment.radiance(directions[free]))
-    points = world.ray_mesh.points(hits.select(met), directions[met])
-    reached = _Vertices.of(world.surface, vertices.paths[met], points, carried[met])
+    points = world.ray_mesh.points(hits.select(hit), directions[hit])
+    reached = _Vertices.of(world.surface, vertices.paths[hit], points, carried[hit])
     return [light, (vertices.paths[free], escaped)], reached
 
 
