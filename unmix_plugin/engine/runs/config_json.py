@@ -72,7 +72,7 @@ def config_from_json(values: Any, default: ConfigT, where: str = "config") -> Co
         ConfigError: an unknown field or a value of the wrong type or range, with the path of the field.
     """
     if not isinstance(values, dict):
-        raise ConfigError(f"{where}: expected an object, found {_shown(values)}")
+        raise _WrongTypeError(where, "an object", values)
     known = {field.name: field for field in _fields(default)}
     unknown = sorted(set(values) - set(known))
     if unknown:
@@ -88,6 +88,16 @@ def config_from_json(values: Any, default: ConfigT, where: str = "config") -> Co
         raise ConfigError(f"{where}: {error}") from error
 
 
+class _WrongTypeError(ConfigError):
+    """A value of another type than expected."""
+
+    def __init__(self, where: str, expected: str, value: Any) -> None:
+        text = repr(value)
+        found = f"{type(value).__name__} {text if len(text) <= 60 else text[:57] + '...'}"
+        super().__init__(f"{where}: expected {expected}, found {found}")
+        self.where, self.expected = where, expected
+
+
 def _fields(config: Any) -> list[dataclasses.Field[Any]]:
     return [field for field in dataclasses.fields(config) if not field.name.startswith("_")]
 
@@ -100,13 +110,16 @@ def _read(value: Any, hint: Any, default: Any, where: str) -> Any:
     if origin is Literal:
         if any(value == choice and type(value) is type(choice) for choice in get_args(hint)):
             return value
-        raise ConfigError(
-            f"{where}: expected one of {', '.join(map(repr, get_args(hint)))}, found {_shown(value)}"
-        )
+        raise _WrongTypeError(where, f"one of {', '.join(map(repr, get_args(hint)))}", value)
     if origin is tuple or origin is list:
         return _read_sequence(value, origin, get_args(hint), default, where)
     if isinstance(origin, type) and issubclass(origin, Mapping):
-        return _read_mapping(value, get_args(hint)[1], default, where)
+        if not isinstance(value, dict):
+            raise _WrongTypeError(where, "an object", value)
+        of_entries, defaults = get_args(hint)[1], default if isinstance(default, Mapping) else {}
+        return {
+            key: _read(entry, of_entries, defaults.get(key), f"{where}.{key}") for key, entry in value.items()
+        }
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
         return config_from_json(value, default if isinstance(default, hint) else hint(), where)
     return _read_scalar(value, hint, where)
@@ -116,23 +129,24 @@ def _read_union(value: Any, choices: tuple[Any, ...], default: Any, where: str) 
     """The member type of `default` is tried first, then the others in their order."""
     classes = [choice for choice in choices if isinstance(choice, type) and get_origin(choice) is None]
     fits_default = [choice for choice in classes if isinstance(default, choice)]
-    problems: list[str] = []
+    problems: list[ConfigError] = []
     for choice in fits_default + [choice for choice in choices if choice not in fits_default]:
         try:
             return _read(value, choice, default, where)
         except ConfigError as error:  # noqa: PERF203
-            problems.append(str(error))
-    head, tail = f"{where}: expected ", f", found {_shown(value)}"
-    if all(problem.startswith(head) and problem.endswith(tail) for problem in problems):
-        expected = [problem.removeprefix(head).removesuffix(tail) for problem in problems]
-        expected.sort(key=lambda kind: kind == "null")
-        raise ConfigError(f"{head}{' or '.join(expected)}{tail}")
-    raise ConfigError("; or ".join(problems))
+            problems.append(error)
+    mismatches = [
+        problem for problem in problems if isinstance(problem, _WrongTypeError) and problem.where == where
+    ]
+    if len(mismatches) == len(problems):
+        expected = sorted((problem.expected for problem in mismatches), key=lambda kind: kind == "null")
+        raise _WrongTypeError(where, " or ".join(expected), value)
+    raise ConfigError("; or ".join(map(str, problems)))
 
 
 def _read_sequence(value: Any, kind: type, hints: tuple[Any, ...], default: Any, where: str) -> Any:
     if not isinstance(value, list):
-        raise ConfigError(f"{where}: expected a list, found {_shown(value)}")
+        raise _WrongTypeError(where, "a list", value)
     repeated = kind is list or (len(hints) == 2 and hints[1] is Ellipsis)
     if not repeated and len(value) != len(hints):
         raise ConfigError(f"{where}: expected {len(hints)} entries, found {len(value)}")
@@ -141,13 +155,6 @@ def _read_sequence(value: Any, kind: type, hints: tuple[Any, ...], default: Any,
         _read(entry, hints[0] if repeated else hints[i], defaults[i], f"{where}[{i}]")
         for i, entry in enumerate(value)
     )
-
-
-def _read_mapping(value: Any, hint: Any, default: Any, where: str) -> dict[str, Any]:
-    if not isinstance(value, dict):
-        raise ConfigError(f"{where}: expected an object, found {_shown(value)}")
-    defaults = default if isinstance(default, Mapping) else {}
-    return {key: _read(entry, hint, defaults.get(key), f"{where}.{key}") for key, entry in value.items()}
 
 
 def _read_scalar(value: Any, hint: Any, where: str) -> Any:
@@ -166,9 +173,4 @@ def _read_scalar(value: Any, hint: Any, where: str) -> Any:
         return float(value)
     if type(value) is hint:
         return value
-    raise ConfigError(f"{where}: expected {kinds.get(hint, str(hint))}, found {_shown(value)}")
-
-
-def _shown(value: Any) -> str:
-    text = repr(value)
-    return f"{type(value).__name__} {text if len(text) <= 60 else text[:57] + '...'}"
+    raise _WrongTypeError(where, kinds.get(hint, str(hint)), value)
