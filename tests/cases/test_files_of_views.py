@@ -27,7 +27,6 @@ from tests.cases.inputs import (
     number_of,
     pose_of,
     processed,
-    ring,
     write_envi,
     write_transforms,
 )
@@ -386,44 +385,113 @@ def test_arrays_are_read_in_the_order_of_their_axes(kind, tmp_path):
     scene.check_values(cube_of)
 
 
-def test_a_scan_that_was_cut_is_not_taken_for_views(tmp_path):
+@pytest.mark.parametrize("interleave", ["bil", "bsq", "bip"])
+@pytest.mark.parametrize("after", ["", "_rd_rf"])
+def test_the_parts_of_a_scan_are_joined(after, interleave, tmp_path):
+    """With the references that lie beside them, as Headwall's cameras write them."""
+    for index in range(VIEWS):
+        folder, lamp = tmp_path / f"scan_{index:02d}", LAMP / 5 * (0.7 + 0.1 * (index % 3))
+        stored = counts(cube(index), lamp, 90)
+        for first, last in ((0, 9), (9, 18), (18, HEIGHT)):  # raw_9 after raw_18 by letters
+            write_envi(folder / f"raw_{first}{after}.hdr", stored[first:last], interleave)
+        write_envi(folder / "darkReference.hdr", counts(np.zeros((5, WIDTH, 7)), lamp, 90), interleave)
+        write_envi(folder / "whiteReference.hdr", counts(np.ones((5, WIDTH, 7)), lamp, 90), interleave)
+    names = [f"scan_{index:02d}/raw_0{after}.hdr" for index in range(VIEWS)]
+    write_transforms(tmp_path / "transforms.json", names)
+    scene = cubes(tmp_path, output=tmp_path / "scene")
+    assert len(scene.views) == VIEWS
+    scene.check_values(lambda name: cube(int(name.split("_")[1])), tolerance=0.03)
+    assert "parts of one scan were joined: raw_0" in scene.printed
+
+
+def test_parts_of_a_scan_with_a_line_missing_are_refused(tmp_path):
     for index in range(VIEWS):
         stored = counts(cube(index), LAMP, 90)
-        for name, rows in (("raw_0", stored[:14]), ("raw_14", stored[14:])):
+        for name, rows in (("raw_0", stored[:14]), ("raw_15", stored[14:])):
             write_envi(tmp_path / f"scan_{index:02d}" / f"{name}.hdr", rows)
     write_transforms(tmp_path / "transforms.json", [f"scan_{index:02d}/raw_0.hdr" for index in range(VIEWS)])
-    message = not_processed(
-        "cubes", "--data", tmp_path, "--poses", "transforms.json", output=tmp_path / "scene"
-    )
-    assert f"{WIDTH} x 14" in message
+    words = "cubes", "--data", tmp_path, "--poses", "transforms.json"
+    message = not_processed(*words, output=tmp_path / "scene")
+    assert "raw_0.hdr and raw_15.hdr are named like parts of one scan" in message
 
 
-def test_a_mosaic_has_no_wavelength(tmp_path):
-    nm = np.linspace(460, 630, 16)
+MOSAIC_NM = np.random.default_rng(0).permutation(np.linspace(460, 630, 16))
+"""The filters of a sensor are not in the order of their wavelengths."""
+
+
+def write_mosaics(root, suffix, filters=(4, 4), rest=0):
+    rows, columns = filters
     for index, name in enumerate(NAMES):
-        mosaic = np.zeros((4 * HEIGHT, 4 * WIDTH), np.uint16)
-        for band, plane in enumerate(np.moveaxis(np.rint(cube(index, nm=nm) * 1000), -1, 0)):
-            mosaic[band // 4 :: 4, band % 4 :: 4] = plane
-        Image.fromarray(mosaic).save(tmp_path / f"{name}.png")
+        values = np.rint(cube(index, nm=MOSAIC_NM[: rows * columns]) * 1000)
+        mosaic = np.zeros((rows * HEIGHT + rest, columns * WIDTH + rest), np.uint16)
+        for band, plane in enumerate(np.moveaxis(values, -1, 0)):
+            mosaic[band // columns : rows * HEIGHT : rows, band % columns : columns * WIDTH : columns] = plane
+        if suffix == ".png":
+            Image.fromarray(mosaic).save(root / f"{name}.png")
+        else:
+            tifffile.imwrite(
+                root / f"{name}.tif", mosaic, compression="zlib" if suffix == ".zip.tif" else None
+            )
+    lens = {
+        "w": columns * WIDTH + rest,
+        "h": rows * HEIGHT + rest,
+        "cx": columns * WIDTH / 2,
+        "cy": rows * HEIGHT / 2,
+    }
+    names = [f"{name}.png" if suffix == ".png" else f"{name}.tif" for name in NAMES]
+    write_transforms(root / "transforms.json", names, focal_px=FOCAL_PX * columns, **lens)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "filters", "rest"), [(".png", (4, 4), 0), (".tif", (4, 4), 0), (".zip.tif", (3, 3), 0)]
+)
+def test_a_mosaic_is_taken_apart_with_the_wavelengths_of_its_filters(suffix, filters, rest, tmp_path):
+    write_mosaics(tmp_path, suffix, filters, rest)
+    nm = MOSAIC_NM[: filters[0] * filters[1]]
+    words = "--mosaic", f"{filters[0]}x{filters[1]}", "--wavelengths", ",".join(f"{one:.3f}" for one in nm)
+    scene = cubes(tmp_path, *words, output=tmp_path / "scene")
+    np.testing.assert_allclose(scene.wavelengths_nm, np.sort(nm), atol=1e-3)
+    scene.check_values(lambda name: cube(number_of(name), nm=nm)[..., np.argsort(nm)])
+    np.testing.assert_allclose(scene.views[0].entries["fl_x"], FOCAL_PX, rtol=1e-6)
+    scene.check_poses(pose_of)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif"])
+def test_a_mosaic_is_called_one_with_what_to_do(suffix, tmp_path):
+    write_mosaics(tmp_path, suffix)
+    words = "cubes", "--data", tmp_path, "--poses", "transforms.json"
+    for more in ((), ("--wavelengths", ",".join(f"{nm:.1f}" for nm in MOSAIC_NM))):
+        message = not_processed(*words, *more, output=tmp_path / "scene")
+        assert "mosaic camera, 4 x 4 filters: give --mosaic 4x4" in message
+
+
+def test_a_grey_picture_is_no_mosaic(tmp_path):
+    for index, name in enumerate(NAMES):
+        grey = np.kron(np.rint(cube(index)[..., 2] * 60000).astype(np.uint16), np.ones((4, 4), np.uint16))
+        Image.fromarray(grey).save(tmp_path / f"{name}.png")
     write_transforms(tmp_path / "transforms.json", NAMES, w=4 * WIDTH, h=4 * HEIGHT)
-    message = not_processed(
-        "cubes", "--data", tmp_path, "--poses", "transforms.json", output=tmp_path / "scene"
-    )
+    words = "cubes", "--data", tmp_path, "--poses", "transforms.json"
+    message = not_processed(*words, output=tmp_path / "scene")
     assert "wavelengths of its 1 bands are unknown" in message
+    assert "mosaic" not in message
 
 
-def test_previews_beside_cubes_are_named(tmp_path):
-    names = [f"session_{index:03d}_cube" for index in range(VIEWS)]
+@pytest.mark.parametrize("of_cube", ["_cube", ""])
+def test_previews_beside_cubes_are_left_out_and_named(of_cube, tmp_path):
+    """As Cubert's export writes them."""
+    names = [f"session_{index:03d}{of_cube}" for index in range(VIEWS)]
     for index, name in enumerate(names):
         stored = np.rint(cube(index) * 10000).astype(np.uint16)
         told = "wavelengths = " + ", ".join(f"{nm:g}" for nm in WAVELENGTHS_NM)
         planes = np.moveaxis(stored, -1, 0)
         tifffile.imwrite(tmp_path / f"{name}.tiff", planes, photometric="minisblack", description=told)
-        tifffile.imwrite(
-            tmp_path / f"session_{index:03d}_pan.tiff", np.kron(stored[..., 0], np.ones((2, 2), np.uint16))
-        )
-    write_transforms(tmp_path / "transforms.json", names, ring(VIEWS))
-    message = not_processed(
-        "cubes", "--data", tmp_path, "--poses", "transforms.json", output=tmp_path / "scene"
-    )
-    assert "session_000_pan.tiff" in message
+        shown = np.kron(stored[..., 0], np.ones((2, 2), np.uint16))
+        tifffile.imwrite(tmp_path / f"session_{index:03d}_pan.tiff", shown)
+        colours = np.rint(cube(index)[..., RED_GREEN_BLUE] * 255).astype(np.uint8)
+        tifffile.imwrite(tmp_path / f"session_{index:03d}_view.tiff", colours, photometric="rgb")
+    write_transforms(tmp_path / "transforms.json", [f"{name}.tiff" for name in names])
+    scene = cubes(tmp_path, output=tmp_path / "scene")
+    assert [view.name for view in scene.views] == names
+    scene.check_values(lambda name: cube(int(name.split("_")[1])))
+    scene.check_poses(lambda name: pose_of(name.removesuffix("_cube")))
+    assert "session_000_pan.tiff, session_000_view.tiff" in scene.printed

@@ -48,6 +48,8 @@ class ReadOptions:
     """Order of the axes in formats that don't fix it: NumPy, MATLAB, HDF5, pages of a TIFF."""
     size: tuple[int, int] | None = None
     """Rows and columns of an image that is stored as a list of pixels, column after column as MATLAB writes it."""
+    mosaic: tuple[int, int] | None = None
+    """Rows and columns of filters in images of one band, of which each pixel of a block is a band."""
     exclude: tuple[Path, ...] = ()
     """Files in a folder that are not views, such as dark and white references."""
 

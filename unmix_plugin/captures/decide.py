@@ -39,6 +39,9 @@ _MOST_REFLECTANCE = 1.5
 """Of bright pixels with highlights."""
 _MOST_ABOVE_ONE = 0.01
 """Share of reflectances above 1 that is still taken for highlights."""
+_MOST_BEYOND, _HEADROOM = 1.25, 1.02
+"""The brightest sampled value over the bright percentile up to which there are no glints; and what is left above the
+brightest, as not all pixels are sampled."""
 _LEAST_BRIGHT = 0.05
 """Bright values below this would lose digits if they were kept."""
 _MOST_BELOW, _LEAST_LEVEL, _PILED_UP = 0.02, 0.005, 0.84
@@ -207,6 +210,8 @@ def choose_scale(
     if all(one.has_one for one in meanings) and above <= _MOST_ABOVE_ONE and bright >= _LEAST_BRIGHT:
         kept = f"values are kept ({meanings[0].description}); {above:.2%} of the sampled ones are above 1"
         return Scale(1.0, kept)
+    if (brightest := float(values.max())) <= _MOST_BEYOND * bright:  # no glints, which would darken the rest
+        return Scale(float(f"{_HEADROOM * brightest:.4g}"), "a little more than the brightest sampled value")
     return Scale(float(f"{bright:.4g}"), f"the {BRIGHT_PERCENTILE:g}th percentile of the sampled values")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from importlib import import_module
@@ -11,7 +12,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from unmix_plugin.captures.cube import Axes, Capture, ReadOptions
-from unmix_plugin.errors import CaptureError
+from unmix_plugin.errors import CaptureError, ConfigError
 
 _LAYOUTS = {
     "cubes": "cubes:find_cubes",
@@ -67,6 +68,9 @@ class ProcessOptions:
     """Data set to take from HDF5, NetCDF and MATLAB files that hold several."""
     axes: Axes | None = None
     """Order of the axes in files that don't fix it, the slowest first: y rows, x columns, b bands."""
+    mosaic: Annotated[str | None, tyro.conf.arg(metavar="ROWSxCOLUMNS")] = None
+    """Images of one band are raw frames of a camera with a mosaic of filters, such as 4x4 or 5x5: each pixel of a block
+    is a band, row by row, in the order of --wavelengths."""
     dark: Path | None = None
     """Dark frame: an image taken with the shutter closed."""
     white: Path | None = None
@@ -102,6 +106,20 @@ class ProcessOptions:
     """Views to keep although they look spoilt: black, overexposed, blurred, with another view's pose."""
     overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Replace a scene that this command made in the output folder."""
+
+
+def parse_mosaic(text: str | None) -> tuple[int, int] | None:
+    """Rows and columns of filters. Raises ConfigError: the text is not such as 4x4.
+
+    >>> parse_mosaic("2x4")
+    (2, 4)
+    """
+    found = None if text is None else re.fullmatch(r"\s*(\d{1,2})\s*[xX×]\s*(\d{1,2})\s*", text)  # noqa: RUF001
+    if text is None:
+        return None
+    if found is None or not 1 < int(found[1]) * int(found[2]) <= 256 or min(int(found[1]), int(found[2])) < 1:
+        raise ConfigError(f"--mosaic {text}: expected rows x columns of filters, such as 4x4")
+    return int(found[1]), int(found[2])
 
 
 def plain_options(options: ProcessOptions) -> dict[str, Any]:

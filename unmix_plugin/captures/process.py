@@ -24,7 +24,7 @@ from unmix_plugin.captures.decisions import decisions_of
 from unmix_plugin.captures.finding_poses import check_pose_options, marked_poses, poses_of_written_views
 from unmix_plugin.captures.layouts.masks import with_mask_files
 from unmix_plugin.captures.match_checks import views_of_other_poses
-from unmix_plugin.captures.options import GONE_LAYOUTS, LAYOUTS, ProcessOptions, find_views
+from unmix_plugin.captures.options import GONE_LAYOUTS, LAYOUTS, ProcessOptions, find_views, parse_mosaic
 from unmix_plugin.captures.plan import Plan, hashes, input_files, make_plan
 from unmix_plugin.captures.poses.estimation import WORK_FILES
 from unmix_plugin.captures.poses.lens import Lens
@@ -260,7 +260,8 @@ def _open_capture(options: ProcessOptions, references: GivenReferences) -> Captu
     named = tuple(path for file in references.files for path in file.files)
     if options.poses is not None:  # an array, perhaps
         named += (Path(options.poses), options.data / options.poses)
-    asked = ReadOptions(options.dataset, wavelengths, options.axes, exclude=named)
+    mosaic = parse_mosaic(options.mosaic)
+    asked = ReadOptions(options.dataset, wavelengths, options.axes, mosaic=mosaic, exclude=named)
     capture = _by_size(find_views(options.layout, options.data, asked))
     if options.mask == "files":
         capture = with_mask_files(capture)
@@ -312,7 +313,8 @@ def _open_references(options: ProcessOptions) -> GivenReferences:
         if path is not None and not path.exists():
             raise CaptureError(f"--{kind} {path}: no such file; give the image of the reference")
         if path is not None:
-            opened[kind] = open_spectral_file(path, ReadOptions(options.dataset, None, options.axes))
+            asked = ReadOptions(options.dataset, None, options.axes, mosaic=parse_mosaic(options.mosaic))
+            opened[kind] = open_spectral_file(path, asked)
     return GivenReferences(**opened)
 
 

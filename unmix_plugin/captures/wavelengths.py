@@ -14,8 +14,8 @@ from jaxtyping import Bool, Float64
 
 from unmix_plugin.captures.names import common_length
 from unmix_plugin.errors import ConfigError, SpectrumError
-from unmix_plugin.spectral.bands import nm_per_unit
-from unmix_plugin.spectral.library.spectral_tables import read_wavelengths, require_wavelengths
+from unmix_plugin.spectral.bands import nm_per_unit, require_nanometres
+from unmix_plugin.spectral.library.spectral_tables import read_wavelengths
 
 _DIGITS = r"\d+(?:[.,]\d+)?"
 _UNIT = r"(?:nm|nanomet(?:er|re)s?|[uµμ]m|micromet(?:er|re)s?|microns?)(?![a-z])"
@@ -144,14 +144,20 @@ def parse_wavelengths(text: str) -> Float64[np.ndarray, " B"]:
     try:
         values = np.array([float(word) for word in text.split(",")])
     except ValueError:
+        if not Path(text).exists():
+            raise ConfigError(
+                f"{what}: neither a list of numbers, such as 620,555,503, nor a CSV file or another table that is there"
+            ) from None
         try:
             values = read_wavelengths(Path(text))
         except SpectrumError as error:
             raise ConfigError(
                 f"{what}: {error}; expected numbers in nm, such as 620,555,503, or a table with a column 'wavelength'"
             ) from error
+    if not np.isfinite(values).all():
+        raise ConfigError(f"{what} holds NaN or infinity; expected band centres in nm")
     try:
-        require_wavelengths(values)
+        require_nanometres(values)
     except SpectrumError as error:
         raise ConfigError(f"{what}: {error}") from error
     return values

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import tyro
 
 from unmix_plugin.captures.cube import Axes, ReadOptions
+from unmix_plugin.captures.options import parse_mosaic
 from unmix_plugin.commands.entry import DONE, USER_ERROR
 from unmix_plugin.engine.printing import tell
 from unmix_plugin.errors import CaptureError, ConfigError, counted
@@ -29,10 +30,14 @@ class ReadingOptions:
     """Order of the axes of arrays, the slowest first: y rows, x columns, b bands."""
     size: tuple[int, int] | None = None
     """Rows and columns of an image that is stored as a matrix of bands and pixels, column after column."""
+    mosaic: Annotated[str | None, tyro.conf.arg(metavar="ROWSxCOLUMNS")] = None
+    """Filters of a mosaic camera, such as 4x4, whose raw frame an image of one band is."""
 
     def for_readers(self) -> ReadOptions:
         """The same as readers take it."""
-        return ReadOptions(dataset=self.dataset, axes=self.axes, size=self.size)
+        return ReadOptions(
+            dataset=self.dataset, axes=self.axes, size=self.size, mosaic=parse_mosaic(self.mosaic)
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

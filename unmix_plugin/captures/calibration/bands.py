@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float32, Float64
 from unmix_plugin.captures.calibration.references import Reference
 from unmix_plugin.captures.cube import MOST_WIDTH, Cube
 from unmix_plugin.captures.options import ProcessOptions
+from unmix_plugin.captures.readers.derived import said_of_mosaic
 from unmix_plugin.captures.report import Code, Remark
 from unmix_plugin.captures.wavelengths import in_ranges
 from unmix_plugin.errors import CaptureError
@@ -136,7 +137,7 @@ def stated_bands(files: Sequence[Cube], options: ProcessOptions) -> BandChoice:
     if table.wavelengths_nm is None:
         raise CaptureError(
             f"{files[0].path}: the wavelengths of its {num_bands} bands are unknown ({table.evidence}); give them with "
-            "--wavelengths"
+            f"--wavelengths{said_of_mosaic(files[0])}"
         )
     choice = BandChoice(table.wavelengths_nm, table.evidence)
     for file in files:

@@ -10,6 +10,9 @@ Cameras of Specim write each view with its own references, and what they make of
     NAME/capture/WHITEDARKREF_NAME.{hdr,raw}                       dark frame of a white that was taken before
     NAME/results/REFLECTANCE_NAME.{hdr,dat}                        taken where a view has no white reference
 
+Cameras of Headwall cut a scan: raw_0, raw_2000 and so on, named by their first line, are joined. Cubert's NAME_cube has
+NAME_pan and NAME_view beside it, which show the same; so have others previews. They are left out and named.
+
 The same names count in any folder and in any case; files such as darkReference are references of the views beside them.
 """
 
@@ -18,13 +21,14 @@ from __future__ import annotations
 import os
 import re
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from unmix_plugin.captures.cube import Capture, CaptureView, Cube, ReadOptions
 from unmix_plugin.captures.layouts.masks import MASK_FOLDERS, is_mask_of
 from unmix_plugin.captures.names import natural_order, view_names
+from unmix_plugin.captures.readers.derived import join_lines
 from unmix_plugin.captures.readers.envi import described_image
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spoilt import UnreadableViews
@@ -61,6 +65,13 @@ _RESULTS = "results"
 _STEPS = ("capture", "captures", "results", "raw")
 """Folders below that of a view, which don't name it."""
 _DEEPEST = 5
+_PART = re.compile(r"(?P<of>raw)_(?P<line>\d+)(?P<after>(?:_[a-z]+)*)", re.IGNORECASE)
+"""A part of a scan by its first line: raw_2000, raw_2000_rd_rf."""
+_SHOWN_TOO = re.compile(
+    r"(?P<of>.+)[_-](?:pan(?:chromatic)?|view|preview|thumb(?:nail)?|quick[_-]?look|ql|rgb|gr[ae]y)",
+    re.IGNORECASE,
+)
+"""Pictures beside NAME or NAME_cube that show the same."""
 _OF_SCENES = ("process.json", "plan.json")
 """In a scene that this command made, or has not finished: its cubes are no views."""
 
@@ -98,9 +109,14 @@ def _open_views(
     references: Sequence[dict[str, Path]],
     files: Sequence[Path],
     options: ReadOptions,
+    joined: Mapping[Path, Sequence[Path]] | None = None,
 ) -> tuple[tuple[CaptureView, ...], tuple[tuple[str, str], ...]]:
     """Views in the order of their names, each with references of its own by their kind, and the picture among the files
-    that lies beside it; and those that can't be opened, with the reason. Raises CaptureError: those are too many."""
+    that lies beside it; and those that can't be opened, with the reason. Raises CaptureError: those are too many.
+
+    Args:
+        joined: Parts of a scan by the first of them.
+    """
     shown = [path for path in files if path.suffix.lower() in _PICTURE_SUFFIXES]
     pictures, views = {path.with_name(_stem(path)): path for path in shown}, []
     unreadable = UnreadableViews(len(paths))
@@ -108,7 +124,9 @@ def _open_views(
         plain = replace(options, wavelengths_nm=None)
         with unreadable.noted(name):
             opened = {kind: open_spectral_file(reference, plain) for kind, reference in own.items()}
-            view = CaptureView(name, _open(path, options), picture=pictures.get(path.with_name(_stem(path))))
+            cubes = [_open(part, options) for part in (joined or {}).get(path, [path])]
+            cube = cubes[0] if len(cubes) == 1 else join_lines(cubes)
+            view = CaptureView(name, cube, picture=pictures.get(path.with_name(_stem(path))))
             views.append(replace(view, **opened))
     return tuple(sorted(views, key=lambda view: natural_order(view.name))), unreadable.found
 
@@ -117,7 +135,14 @@ def _capture_of_groups(root: Path, folders: dict[Path, list[Path]], options: Rea
     """Views of one folder or of a tree, with the references that were taken for each."""
     groups: dict[tuple[Path, str], dict[str, Path]] = defaultdict(dict)
     left_out: list[Path] = []
-    for folder, cubes in folders.items():
+    joined: dict[Path, list[Path]] = {}
+    shown_too: list[Path] = []
+    for folder, there in folders.items():
+        beside = _shown_too(there)
+        shown_too += beside
+        joined |= (parts := _parts_of_scans([path for path in there if path not in beside]))
+        further = {path for own in parts.values() for path in own[1:]}
+        cubes = [path for path in there if path not in beside and path not in further]
         left_out += _sort_into(groups, _place(folder, root), cubes, is_tree=folder != root)
     complete = {key: group for key, group in groups.items() if "cube" in group or "result" in group}
     if not complete:
@@ -140,7 +165,7 @@ def _capture_of_groups(root: Path, folders: dict[Path, list[Path]], options: Rea
         for group, kind in zip(complete.values(), kinds, strict=True)
     ]
     there = [path for folder in folders for path in _visible_files(folder)]
-    views, unreadable = _open_views(names, paths, own, there, options)
+    views, unreadable = _open_views(names, paths, own, there, options, joined)
     counts = Counter(reference for references in own for reference in references)
     notes = [
         f"{counts[kind]} of {len(views)} views have a {what}, which is used{' for all' * (counts[kind] == 1)} unless "
@@ -150,12 +175,46 @@ def _capture_of_groups(root: Path, folders: dict[Path, list[Path]], options: Rea
     ]
     if take_results:
         notes.append("views are the reflectances that the camera wrote, as not all have a white reference")
+    if shown_too:
+        named = name_some([path.name for path in shown_too])
+        notes.append(f"left out, as named like pictures of the cubes beside them: {named}")
     if left_out:
         named = name_some([path.name for path in left_out])
         notes.append(f"left out, as named like references: {named}; use one with --white or --dark")
     lost = [path.name for path in there if path.suffix.lower() in _NUMBERS and header_beside(path) is None]
     warnings = (f"left out, as no header beside them says what they hold: {name_some(lost)}",) if lost else ()
     return Capture("cubes", root, views, notes=tuple(notes), warnings=warnings, unreadable=unreadable)
+
+
+def _parts_of_scans(cubes: Sequence[Path]) -> dict[Path, list[Path]]:
+    """Files of one folder that are parts of a scan, in order, by the first of them: each is named by the line that
+    follows the last one before it."""
+    series: dict[tuple[str, str], list[tuple[int, Path]]] = defaultdict(list)
+    for path in cubes:
+        if (match := _PART.fullmatch(_stem(path))) is not None:
+            series[match["of"].casefold(), match["after"].casefold()].append((int(match["line"]), path))
+    found = {}
+    for parts in series.values():
+        (line, first), *others = sorted(parts)
+        end, own = line, [first]
+        for line, path in others:
+            end += open_spectral_file(own[-1]).shape[0]
+            if line != end:
+                raise CaptureError(
+                    f"{first.parent}: {own[-1].name} and {path.name} are named like parts of one scan by their first "
+                    f"lines, but the second begins at line {line}, and the first ends before {end}; rename them"
+                )
+            own.append(path)
+        if len(own) > 1:
+            found[first] = own
+    return found
+
+
+def _shown_too(cubes: Sequence[Path]) -> list[Path]:
+    """Files whose names are those of pictures of another cube of the folder."""
+    stems = {_stem(path).casefold() for path in cubes}
+    owners = {path: match["of"].casefold() for path in cubes if (match := _SHOWN_TOO.fullmatch(_stem(path)))}
+    return [path for path, of in owners.items() if of in stems or {f"{of}_cube", f"{of}-cube"} & stems]
 
 
 def _sort_into(

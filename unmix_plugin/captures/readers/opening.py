@@ -22,6 +22,7 @@ from unmix_plugin.captures.cube import (
 )
 from unmix_plugin.captures.readers.band_files import open_band_folder
 from unmix_plugin.captures.readers.containers import KINDS, open_container, open_hdf5
+from unmix_plugin.captures.readers.derived import said_of_mosaic, take_apart
 from unmix_plugin.captures.readers.envi import (
     described_by_header,
     described_image,
@@ -95,6 +96,8 @@ def open_spectral_file(path: Path, options: ReadOptions | None = None) -> Cube:
     options = options or ReadOptions()
     try:
         opened = _opened(path, options)
+        if options.mosaic is not None:
+            opened = take_apart(opened, options.mosaic)
         height, width, num_bands = opened.shape
         size = f"{height} rows x {width} columns x {num_bands} bands"
         if 0 in opened.shape:
@@ -111,7 +114,9 @@ def open_spectral_file(path: Path, options: ReadOptions | None = None) -> Cube:
         if given is None:
             return opened
         if len(given) != num_bands:
-            raise CaptureError(f"{opened.path}: {len(given)} wavelengths were given for {size}")
+            raise CaptureError(
+                f"{opened.path}: {len(given)} wavelengths were given for {size}{said_of_mosaic(opened)}"
+            )
         bands = replace(opened.bands, wavelengths_nm=given, evidence="given by the user", is_given=True)
         return replace(opened, bands=bands)
     except CaptureError:
