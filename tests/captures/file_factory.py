@@ -16,6 +16,7 @@ from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
 from unmix_plugin.captures.cube import BandTable, Cube, Exposure, Factor
 from unmix_plugin.captures.numbers import Held, Numbers
+from unmix_plugin.captures.report import Kind, sentences
 
 
 def exposure_of_file(
@@ -135,6 +136,16 @@ def header_text(cube: np.ndarray, interleave: str, change: Mapping[str, Any]) ->
     return "ENVI\n" + "".join(f"{key} = {value}\n" for key, value in entries.items() if value is not None)
 
 
+def warnings_of(file: Cube) -> list[str]:
+    """What may be wrong with a file, in sentences."""
+    return sentences(file.remarks, Kind.WRONG)
+
+
+def notes_of(file: Cube) -> list[str]:
+    """What else is odd about it."""
+    return sentences(file.remarks, Kind.DONE)
+
+
 def check_file(file: Cube, **expected: Any) -> None:
     """That a file is and says what is expected; texts (`evidence`, `warning`, `note`) may be parts of what it says.
 
@@ -151,7 +162,7 @@ def check_file(file: Cube, **expected: Any) -> None:
                 np.testing.assert_allclose(file.linear.apply(file.read(), slice(None)), value, atol=2e-6)
             case "nm" | "fwhm":
                 found = bands.wavelengths_nm if name == "nm" else bands.fwhm_nm
-                assert (found is None) == (value is None), file.notes
+                assert (found is None) == (value is None), file.remarks
                 if found is not None:
                     np.testing.assert_allclose(found, np.broadcast_to(value, found.shape), atol=1e-5)
             case "bad":
@@ -160,12 +171,13 @@ def check_file(file: Cube, **expected: Any) -> None:
             case "evidence":
                 assert value in bands.evidence
             case "warning" | "note":
-                said = file.warnings if name == "warning" else file.notes
-                assert any(value in text for text in said), said
+                sentences_of = {"warning": warnings_of, "note": notes_of}[name]
+                assert any(value in text for text in sentences_of(file)), sentences_of(file)
             case "names":
                 assert bands.names == tuple(value)
             case _:
                 facts = {"scale": file.linear and file.linear.scale, **file.facts}
+                facts |= {"warnings": tuple(warnings_of(file)), "notes": tuple(notes_of(file))}
                 found = getattr(file, name) if hasattr(file, name) else facts.get(name)
                 assert found == (pytest.approx(value) if isinstance(value, float) else value), name
 

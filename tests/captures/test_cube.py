@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.captures.file_factory import exposure_of_file, file_of, present
+from tests.captures.file_factory import exposure_of_file, file_of, present, warnings_of
 from unmix_plugin.captures.calibration.exposures import exposure_of
 from unmix_plugin.captures.cube import BandTable, Cube, linear_values
 from unmix_plugin.captures.numbers import Held, Numbers
@@ -32,8 +32,8 @@ def test_a_stack_keeps_what_its_parts_share_and_lists_the_rest(tmp_path):
     assert (stack.bands.evidence, present(stack.linear).scale) == ("test", None)
     np.testing.assert_array_equal(stack.read(slice(1, 2), np.array([1, 0]))[0, 0], [2, 1])
     alike = stack_bands([part(tmp_path, 1, scale=3.0), part(tmp_path, 2, scale=3.0)], tmp_path)
-    assert (present(alike.linear).scale, alike.facts, alike.warnings) == (3.0, {}, ())
-    assert "only some of the files of one view state gains" in stack.warnings[0]
+    assert (present(alike.linear).scale, alike.facts, warnings_of(alike)) == (3.0, {}, [])
+    assert "only some of the files of one view state gains" in warnings_of(stack)[0]
     mixed = stack_bands([*parts, replace(part(tmp_path, 3), bands=BandTable())], tmp_path).bands
     assert (mixed.wavelengths_nm, mixed.evidence) == (None, "only some of the files give wavelengths")
 
@@ -58,8 +58,8 @@ def test_a_stack_has_the_exposure_of_each_band_or_none(tmp_path, first_gain, sec
     parts = [part(tmp_path, 1, time=0.1, gain=first_gain), part(tmp_path, 2, **second)]
     stack = stack_bands(parts, tmp_path)
     assert (stack.facts.get("exposure_s"), stack.facts.get("gain", 1.0)) == (exposures, 1.0)
-    assert len(stack.warnings) == (said is not None)
-    assert said is None or said in stack.warnings[0]
+    assert len(warnings_of(stack)) == (said is not None)
+    assert said is None or said in warnings_of(stack)[0]
 
 
 def test_a_stack_has_one_f_number_and_exposures_that_fit_it(tmp_path):
@@ -79,7 +79,7 @@ def test_a_stack_keeps_times_and_gains_without_f_numbers_that_only_some_parts_ha
     del facts[lacking]["f_number"]
     stack = stack_bands([part(tmp_path, i, **own) for i, own in enumerate(facts)], tmp_path)
     np.testing.assert_allclose(np.broadcast_to(present(exposure_of(stack)), 2), 0.1 * np.array(gains))
-    assert f"is known of some bands and not of {lacking}: exposures are compared" in stack.warnings[0]
+    assert f"is known of some bands and not of {lacking}: exposures are compared" in warnings_of(stack)[0]
 
 
 NO_LUCK = r"a: can't be read \(RuntimeError: no luck at all\)"

@@ -8,17 +8,17 @@ from unmix_plugin.captures.report import Code, Kind, Remark, merged, sentences
 
 
 def test_equal_remarks_become_one_that_names_all_places():
-    cut = [Remark.of(Code.FILE_WARNING, [name], text="cut short") for name in ("a", "b", "a")]
-    other = Remark.of(Code.FILE_WARNING, ["c"], text="no unit")
+    cut = [Remark.of(Code.BYTES_LEFT, [name], left=3) for name in ("a", "b", "a")]
+    other = Remark.of(Code.BYTES_LEFT, ["c"], left=4)
     assert [(one.where, one.values) for one in merged([*cut, other])] == [
-        (("a", "b"), {"text": "cut short"}),
-        (("c",), {"text": "no unit"}),
+        (("a", "b"), {"left": 3}),
+        (("c",), {"left": 4}),
     ]
 
 
 def test_many_places_are_counted_in_the_sentence():
-    remark = Remark.of(Code.FILE_WARNING, "abcde", text="cut short")
-    assert remark.sentence == "a, b, c and 2 more: cut short"
+    remark = Remark.of(Code.BYTES_LEFT, "abcde", left=3)
+    assert remark.sentence == "a, b, c and 2 more: 3 bytes more than the header describes"
 
 
 def test_kinds_are_properties_of_codes_and_tell_where_a_sentence_goes():
@@ -28,7 +28,7 @@ def test_kinds_are_properties_of_codes_and_tell_where_a_sentence_goes():
     assert [code for code in Code if code.looks_wrong] == [code for code in Code if code.kind is Kind.WRONG]
 
 
-@pytest.mark.parametrize("code", [Code.FILE_WARNING, Code.NOTE])
+@pytest.mark.parametrize("code", [Code.CAPTURE_WARNING, Code.NOTE])
 def test_a_remark_is_written_with_its_code_and_values(code: Code):
     written = json.loads(json.dumps(Remark.of(code, ["a"], text="cut").to_json()))
     assert written == {"code": code.name.lower(), "where": ["a"], "values": {"text": "cut"}}

@@ -22,13 +22,9 @@ from unmix_plugin.captures.names import natural_order
 from unmix_plugin.captures.numbers import Axes, BandIndex, Numbers, find_zeros
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.pose_set import PoseSet
+from unmix_plugin.captures.report import Code, Remark
 from unmix_plugin.errors import CaptureError, install_hint
 
-COLOURS_AS_STORED = (
-    "red, green and blue are taken as light, as stored; if they are a picture's for people (sRGB), save it as PNG of "
-    "8 bits"
-)
-"""Warning of colours that no header says to be linear."""
 MOST_WIDTH = 0.25
 """Width of a band, as a share of its wavelength, up to which one wavelength stands for it; panchromatic: 0.7."""
 _MEASURES_NOTHING = 1e30
@@ -237,10 +233,8 @@ class Cube:
     """Stored numbers that stand for no measurement."""
     valid_range: tuple[float, float] | None = None
     """Least and greatest stored number that was measured, if the file says so."""
-    notes: tuple[str, ...] = ()
-    """What is odd about the file, one sentence each."""
-    warnings: tuple[str, ...] = ()
-    """What may make values, wavelengths or geometry wrong, one sentence each: reports begin with it."""
+    remarks: tuple[Remark, ...] = ()
+    """What is odd about the file."""
     exposure: Exposure = Exposure()
     camera: CameraTags = CameraTags()
     is_srgb: bool = False
@@ -301,6 +295,10 @@ class Cube:
             return self.numbers.read(slice(self.first_line + rows.start, self.first_line + rows.stop), bands)
         parts = [self.parts[band] for band in np.arange(len(self.parts))[bands]]
         return np.concatenate([part.read(rows) for part in parts], axis=-1)
+
+    def remarking(self, *remarks: Remark) -> Cube:
+        """The cube with more remarks."""
+        return replace(self, remarks=(*self.remarks, *remarks))
 
     @property
     def meaning(self) -> Meaning:
@@ -382,12 +380,11 @@ def find_missing(
 
 
 def with_mask(file: Cube, name: str, mask: Numbers) -> Cube:
-    """The file with pixels missing where a mask, called `name` in notes, is 0 in one of the bands that are asked for.
+    """The file with pixels missing where a mask, called `name` in remarks, is 0 in one of the bands that are asked for.
 
     Source: GDAL, RFC 15: band masks: 0 is no data.
     """
-    note = f"pixels where {name} is 0 count as not measured"
-    return replace(file, masks=(*file.masks, mask), notes=(*file.notes, note))
+    return replace(file, masks=(*file.masks, mask)).remarking(Remark.of(Code.MASK_USED, mask=name))
 
 
 def _is_number(stored: np.ndarray, number: float) -> Bool[np.ndarray, "*shape"]:

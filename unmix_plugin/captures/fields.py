@@ -3,7 +3,7 @@ units.
 
 Every reader brings what a file says to *entries*: texts (of lists with commas), numbers or lists by name, in any case,
 with spaces or `_`. `state_bands`, `state_linear` and `state_exposure` look them up by the tables here; `check_bands`
-converts and checks. What is left out, and why, is appended to the reader's list of warnings.
+converts and checks. What is left out, and why, is appended to the reader's list of remarks.
 
 Specim writes `tint = 10.5` (milliseconds), others `integration time = 5 ms`, `exposure_us = 8000`, `Exposure Time (s)`.
 Only ratios between files count, so a missing unit matters only where some files have one.
@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from unmix_plugin.captures.cube import BandTable, Exposure, Factor, Linear, Meaning, linear_values
+from unmix_plugin.captures.report import Code, Remark
 from unmix_plugin.captures.wavelengths import PLAUSIBLE_NM, wavelengths_in_names
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.spectral.bands import are_band_numbers, nm_per_unit
@@ -107,7 +108,6 @@ OF_ALL_IMAGES = (_CF_FACTOR, _DIVISOR, "add_offset")
 _LEAST_WIDTH_NM = 0.05
 """Widths below this are in another unit, as are those wider than their wavelengths."""
 _UNUSABLE = "the file gives no wavelengths that can be used, see the notes"
-_ASK = "correct them there, or give them yourself (--wavelengths of unmix-process)"
 
 
 def plain_names(entries: Mapping[str, Any]) -> dict[str, str]:
@@ -219,7 +219,7 @@ def state_linear(
     entries: Mapping[str, Any],
     where: str,
     format_of: Format,
-    warnings: list[str],
+    remarks: list[Remark],
 ) -> Linear | None:
     """Gains and offsets among entries, or one factor that divides. A lone `gain` is a part of the exposure.
 
@@ -252,7 +252,7 @@ def state_linear(
             found.append(linear)
             has_gains |= bool(gains)
     if len(found) > 1:
-        warnings.append(f"{found[0].source} is applied, not {found[1].source}")
+        remarks.append(Remark.of(Code.GAINS_CHOSEN, applied=found[0].source, other=found[1].source))
     key = named.get(_DIVISOR, "")
     factors = _factors(path, key, entries.get(key, "1"))
     if set(factors) == {1.0}:
@@ -307,23 +307,23 @@ def _factors(path: Path, key: str, value: Any) -> list[float]:
     )
 
 
-def check_bands(stated: StatedBands, num_bands: int, warnings: list[str]) -> BandTable:
+def check_bands(stated: StatedBands, num_bands: int, remarks: list[Remark]) -> BandTable:
     """The table of an image's bands, with units brought to nm and nothing impossible accepted.
 
     A wavelength of 0 marks a band that is not used, as PRISMA's files have it: the band counts as bad.
     """
-    names = _fitting("names of bands", stated.names, num_bands, warnings)
+    names = _fitting("names of bands", stated.names, num_bands, remarks)
     centres, evidence, factor, unused = None, BandTable.evidence, None, np.zeros(num_bands, bool)
     if stated.centres is not None:
         evidence = _UNUSABLE
-        values = _numbers(f"{stated.where}: wavelengths", stated.centres, num_bands, warnings)
+        values = _numbers(f"{stated.where}: wavelengths", stated.centres, num_bands, remarks)
         if values is not None:
             unused = values == 0 if (values > 0).any() else unused
             used = values[~unused]
             factor, found = _nm_per_stated(values, used, stated)
-            if factor is None:
-                warnings.append(found)
-            else:
+            if isinstance(found, Remark):
+                remarks.append(found)
+            elif factor is not None:
                 # An unused band gets the wavelength of the nearest band that is used, of two the first.
                 middles = np.convolve(np.flatnonzero(~unused), (0.5, 0.5), "valid")
                 nearest = np.searchsorted(middles, np.arange(num_bands))
@@ -336,25 +336,25 @@ def check_bands(stated: StatedBands, num_bands: int, warnings: list[str]) -> Ban
         named_fwhm = named[2] if stated.fwhm is None else None
         factor = nm_per_unit((stated.unit or "").strip()) or 1.0
     if centres is not None and (np.diff(centres[~unused]) == 0).any():
-        warnings.append("two bands beside each other have the same wavelength")
-    fwhm = _numbers("FWHM", stated.fwhm, num_bands, warnings)
+        remarks.append(Remark.of(Code.WAVELENGTH_REPEATED))
+    fwhm = _numbers("FWHM", stated.fwhm, num_bands, remarks)
     if fwhm is not None and centres is None:
-        warnings.append("FWHM are left out, as the file gives no wavelengths beside them")
+        remarks.append(Remark.of(Code.WIDTHS_ALONE))
     elif fwhm is not None and (fwhm[~unused] <= 0).any():
-        warnings.append(f"FWHM are left out: they go down to {fwhm[~unused].min():g}")
+        remarks.append(Remark.of(Code.WIDTHS_NOT_POSITIVE, low=f"{fwhm[~unused].min():g}"))
     if fwhm is not None and factor is not None and centres is not None and (fwhm[~unused] > 0).all():
         fwhm = np.where(unused, fwhm[~unused].mean(), fwhm)
-        fwhm = _widths_nm(fwhm, (stated.fwhm_unit or "").strip(), factor, centres, warnings)
+        fwhm = _widths_nm(fwhm, (stated.fwhm_unit or "").strip(), factor, centres, remarks)
     else:
         fwhm = named_fwhm
-    good = _numbers("marks of bad bands", stated.good, num_bands, warnings)
+    good = _numbers("marks of bad bands", stated.good, num_bands, remarks)
     bad = unused if good is None else (good == 0) | unused
     marks = None if good is None and not unused.any() else bad
     return BandTable(centres, evidence, fwhm, marks, None if names is None else tuple(map(str, names)))
 
 
 def _widths_nm(
-    widths: np.ndarray, unit: str, factor: float, centres: np.ndarray, warnings: list[str]
+    widths: np.ndarray, unit: str, factor: float, centres: np.ndarray, remarks: list[Remark]
 ) -> np.ndarray | None:
     """Widths by their own unit, otherwise by that of the wavelengths, of which one is `factor` nm, or by nm or
     micrometres where that can't be; None with a warning where nothing fits."""
@@ -363,43 +363,45 @@ def _widths_nm(
     low, high = widths.min(), widths.max()
     if not fitting:
         said = f"{low * tried[0]:g} to {high * tried[0]:g} nm" if tried[0] > 0 else f"in {unit!r}"
-        warnings.append(f"FWHM are left out: they would be {said}")
+        remarks.append(Remark.of(Code.WIDTHS_IMPOSSIBLE, range=said))
         return None
     if fitting[0] != tried[0]:
-        taken = f"{low:g} to {high:g} taken as {'nm' if fitting[0] == 1.0 else 'micrometres'}"
-        warnings.append(f"FWHM: {taken}, as they can't be in the unit of the wavelengths")
+        taken = "nm" if fitting[0] == 1.0 else "micrometres"
+        remarks.append(Remark.of(Code.WIDTHS_IN_OTHER_UNIT, low=f"{low:g}", high=f"{high:g}", unit=taken))
     return widths * fitting[0]
 
 
 def _fitting(
-    what: str, values: Sequence[object] | None, count: int, warnings: list[str]
+    what: str, values: Sequence[object] | None, count: int, remarks: list[Remark]
 ) -> Sequence[object] | None:
     if values is None or len(values) == count:
         return values
-    warnings.append(f"{what} are left out: {len(values)} for {count} bands")
+    remarks.append(Remark.of(Code.BAND_LIST_MISFIT, what=what, number=len(values), bands=count))
     return None
 
 
 def _numbers(
-    what: str, values: Sequence[object] | None, count: int, warnings: list[str]
+    what: str, values: Sequence[object] | None, count: int, remarks: list[Remark]
 ) -> np.ndarray | None:
     """One finite number a band; None with a warning where it is anything else."""
-    values = _fitting(what, values, count, warnings)
+    values = _fitting(what, values, count, remarks)
     if values is None:
         return None
     try:
         numbers = np.array([float(str(value)) for value in values])
     except ValueError as error:
-        warnings.append(f"{what} are not a list of numbers ({str(error)[:80]}) and are left out")
+        remarks.append(Remark.of(Code.BAND_LIST_NO_NUMBERS, what=what, error=str(error)[:80]))
         return None
     if not np.isfinite(numbers).all():
         band = int(np.argmin(np.isfinite(numbers)))
-        warnings.append(f"{what} are left out: that of band {band} (from 0) is {numbers[band]:g}")
+        remarks.append(Remark.of(Code.BAND_LIST_NOT_FINITE, what=what, band=band, value=f"{numbers[band]:g}"))
         return None
     return numbers
 
 
-def _nm_per_stated(values: np.ndarray, used: np.ndarray, stated: StatedBands) -> tuple[float | None, str]:
+def _nm_per_stated(
+    values: np.ndarray, used: np.ndarray, stated: StatedBands
+) -> tuple[float, str] | tuple[None, Remark]:
     """How many nm one of the file's unit is, and the evidence; None and why where wavelengths can't be true.
 
     Args:
@@ -411,20 +413,21 @@ def _nm_per_stated(values: np.ndarray, used: np.ndarray, stated: StatedBands) ->
     def is_plausible(factor: float) -> bool:
         return PLAUSIBLE_NM[0] <= low * factor and high * factor <= PLAUSIBLE_NM[1]
 
+    facts = {"entry": stated.where, "low": f"{low:g}", "high": f"{high:g}"}
     unit = (stated.unit or "").strip()
     factor, evidence = nm_per_unit(unit), f"{stated.where}, {unit}"
     if factor is None and unit.lower() in ("", "unknown"):
         if are_band_numbers(values):
-            found = f"{values[0]:g} to {high:g} with no unit count the bands"
-            return None, f"{stated.where}: {found} and are no wavelengths; {_ASK}"
+            first = f"{values[0]:g}"
+            return None, Remark.of(Code.WAVELENGTHS_COUNT_BANDS, **facts | {"low": first})
         factor = next((f for f in (1.0, 1e3) if is_plausible(f)), None)
         taken = "nm" if factor == 1.0 else "micrometres"
         evidence = f"{stated.where}, no unit: {low:g} to {high:g} taken as {taken}"
     if factor is None:
         given = f"the unit {unit!r}" if unit else "no unit"
-        return None, f"{stated.where}: {low:g} to {high:g} with {given} can't be brought to nm; {_ASK}"
+        return None, Remark.of(Code.WAVELENGTHS_WITHOUT_UNIT, **facts, unit=given)
     if not is_plausible(factor):
-        return None, f"{stated.where}: {low:g} to {high:g} can't be in {unit}; {_ASK}"
+        return None, Remark.of(Code.WAVELENGTHS_IMPOSSIBLE, **facts, unit=unit)
     return factor, evidence
 
 
@@ -499,13 +502,13 @@ _VALUE = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)(?:/(\d+(?:\.\d*)?
 """`20`, `20 ms`, `1/50 s`."""
 
 
-def state_exposure(entries: Mapping[str, Any], where: str, warnings: list[str]) -> Exposure:
+def state_exposure(entries: Mapping[str, Any], where: str, remarks: list[Remark]) -> Exposure:
     """What entries of a file say of its exposure.
 
     Args:
         entries: Texts, numbers or lists (one number a band) by name; EXIF's begin with that word.
         where: What they are, for people: `header field`.
-        warnings: What is not understood is appended.
+        remarks: What is not understood is appended.
 
     >>> state_exposure({"tint": "20"}, "header field", []).time.number
     0.02
@@ -530,8 +533,8 @@ def state_exposure(entries: Mapping[str, Any], where: str, warnings: list[str]) 
         if row.factor.is_optional and (len(values) != 1 or not known or not 0 < known[0][0] < np.inf):
             continue
         if not known or len(known) < len(values):
-            said = f"{where} '{key}' is {', '.join(items)[:60]!r}, which is not understood"
-            warnings.append(f"{said}: exposures may differ")
+            stated = repr(", ".join(items)[:60])
+            remarks.append(Remark.of(Code.EXPOSURE_NOT_UNDERSTOOD, entry=f"{where} '{key}'", value=stated))
         elif row.factor not in found:
             numbers = tuple(number for number, _ in known)
             assumed = "" if all(has_unit for _, has_unit in known) else row.assumed
@@ -541,11 +544,11 @@ def state_exposure(entries: Mapping[str, Any], where: str, warnings: list[str]) 
     if not is_exif:
         found = {factor: value for factor, value in found.items() if not factor.is_optional}
     f_number = found.get(_Exposed.F_NUMBER)
-    gain = _whole_gain(found, warnings)
+    gain = _whole_gain(found, remarks)
     return Exposure(found.get(_Exposed.TIME), gain, None if f_number is None else f_number.numbers[0])
 
 
-def _whole_gain(found: Mapping[_Exposed, Factor], warnings: list[str]) -> Factor | None:
+def _whole_gain(found: Mapping[_Exposed, Factor], remarks: list[Remark]) -> Factor | None:
     """EXIF's speed, the whole gain, or the product of its parts."""
     whole = found.get(_Exposed.SPEED, found.get(_Exposed.GAIN))
     parts = [found[part] for part in (_Exposed.ANALOG_GAIN, _Exposed.DIGITAL_GAIN) if part in found]
@@ -553,7 +556,7 @@ def _whole_gain(found: Mapping[_Exposed, Factor], warnings: list[str]) -> Factor
         return whole
     sources = " and ".join(part.source for part in parts)
     if len({len(part.numbers) for part in parts} - {1}) > 1:
-        warnings.append(f"{sources} are lists of different lengths: exposures may differ")
+        remarks.append(Remark.of(Code.GAIN_PARTS_MISFIT, entries=sources))
         return None
     product = np.multiply.reduce(np.broadcast_arrays(*(part.numbers for part in parts)))
     assumed = next((part.assumed for part in parts if part.assumed), "")

@@ -271,11 +271,12 @@ def make_plan(
             *remarks_on_mask,
             *_doubts_of_kinds(sensors, scale, views),
             *_remarks_on_pictures([view.cube for view in views]),
-            *(Remark.of(Code.NOTE, text=text) for view in views for text in view.cube.notes),
+            *(one for view in views for one in view.cube.remarks if not one.code.looks_wrong),
             *(
-                Remark.of(Code.FILE_WARNING, [name], text=text)
+                replace(one, where=(name,))
                 for name, file in files
-                for text in file.warnings
+                for one in file.remarks
+                if one.code.looks_wrong
             ),
         ),
         option_files=(*(path for file in given.files for path in file.files), *map(Path, tables)),

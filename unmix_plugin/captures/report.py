@@ -13,10 +13,12 @@ import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum, unique
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from unmix_plugin.engine.decisions import Decision, decision_table
 from unmix_plugin.errors import counted, name_some
+
+if TYPE_CHECKING:
+    from unmix_plugin.engine.decisions import Decision
 
 _WIDTH = 110
 
@@ -37,16 +39,127 @@ def _done(template: str) -> tuple[Kind, str]:
     return Kind.DONE, template
 
 
+def _doubt(template: str) -> tuple[Kind, str]:
+    """Of a file: what may make its values, wavelengths or geometry wrong; its sentence begins with names of files."""
+    return Kind.WRONG, "{files}" + template
+
+
 @unique
 class Code(Enum):
     """All that may be remarked, with its kind and the template of its sentence."""
 
     NOTE = _done("{text}")
-    """Of a reader or a layout, which has no code of its own for it."""
-    FILE_WARNING = _wrong("{where}: {text}")
-    """Of a reader, which has no code of its own for it."""
+    """Of a layout or of a library, which has no code of its own for it."""
     CAPTURE_WARNING = _wrong("{text}")
     """Of a layout or a source of poses, which has no code of its own for it."""
+
+    # Files: which numbers are the image, and of which axes.
+    HEADER_LINES_UNREAD = _doubt("{lines:line} of the header not read for want of '=': {first}")
+    HEADER_OF_OTHER_SIZE = _doubt(
+        "{header} describes {found} rows, columns and bands, the image has {size}: not used"
+    )
+    BYTE_ORDER_ASSUMED = _doubt("the header has no byte order; taken as little-endian")
+    BYTES_LEFT = _doubt("{left} bytes more than the header describes")
+    DARK_LINES_APART = _done(
+        "the lines from '{entry}' on were taken with the shutter closed: they are no part of the image, but the dark "
+        "frame of raw numbers that have no other"
+    )
+    DARK_LINES_SEVERAL = _doubt("'{entry}' has {count_stated} numbers: dark lines may be left in the image")
+    DARK_LINES_NO_NUMBER = _doubt("'{entry}' is {value}, no number: dark lines may be left in the image")
+    NO_DATA_NO_NUMBER = _doubt("'{entry}' is {value}, no number: not used")
+    ENTRY_NO_NUMBER = _doubt("{entry} is {value}, no number: not used")
+    ENTRY_UNREADABLE = _doubt("{entry} can't be read: not used")
+    AXES_AMBIGUOUS = _doubt(
+        "{number} wavelengths fit several axes of {shape}; bands are taken to be axis {axis}"
+    )
+    AXES_UNLIKELY = _doubt(
+        "bands are taken to be axis {axis} of {shape}, though axis {shortest} is the shortest; if that is wrong, say "
+        "which axis is which (--axes {other})"
+    )
+    OPTION_UNUSED = _done("--{option} does nothing: the format {reader} leaves no choice")
+    ARRAYS_UNUSED = _done("also in the file, and not used: {names}")
+    PAGES_LEFT_OUT = _doubt("pages of other sizes or types are left out: {pages}")
+    PARTS_LEFT_OUT = _doubt("only the first part is taken; the file also has the parts {names}")
+    PARTS_ALIKE = _doubt(
+        "wavelengths of the first part are taken; {number} other parts have the same ones (--dataset)"
+    )
+    LAYER_TAKEN = _doubt("layer '{layer}' is taken; the file also has {others} (--dataset)")
+    BANDS_OF_OTHER_KINDS = _done("{number} {pictures} than {kind} in the folder left out")
+    MASK_OF_OTHER_SIZE = _doubt(
+        "the mask {mask} has {size} rows, columns and bands, not those of the image: not used"
+    )
+    MASK_USED = _done("pixels where {mask} is 0 count as not measured")
+    WINDOW_IS_PART = _done("the data window is a part of the picture: pixels outside are missing")
+    BLOCKS_ABSENT = _doubt(
+        "{blocks:block} of the image left out in the file, which has no no-data value: {taken}; if these are dark and "
+        "not missing, write the file without gaps (GDAL's SPARSE_OK=FALSE)"
+    )
+    CHUNKS_ABSENT = _doubt(
+        "{chunks:chunk} of the image never written, and no attribute says what marks them: pixels of {fill} {taken}; "
+        "if these were measured, write the file in full"
+    )
+    OPACITY_IS_A_BAND = _doubt("a number of each pixel is marked as opacity; it is kept as a band")
+    OPACITY_LEFT_OUT = _done("the picture has opacity, which is not a band and is left out")
+
+    # Files: what numbers mean.
+    COLOURS_AS_STORED = _doubt(
+        "red, green and blue are taken as light, as stored; if they are a picture's for people (sRGB), save it as PNG "
+        "of 8 bits"
+    )
+    GDAL_DAMAGED = _doubt("GDAL's metadata in the file is damaged: gains and wavelengths in it are not used")
+    XML_DAMAGED = _doubt("{xml} is damaged: what it says is not used")
+    XML_OF_OTHER_BANDS = _doubt(
+        "{xml} describes {described:band}, the image has {bands}: wavelengths and gains in it are not used"
+    )
+    FACTOR_NOT_APPLIED = _doubt("'{entry}' is {value}: not applied, as ENVI knows no such field")
+    GAINS_CHOSEN = _doubt("{applied} is applied, not {other}")
+    GAINS_OF_SOME_BANDS = _doubt(
+        "{entry} is stated of {stated} of {bands} bands: that of the others is taken for {usual}, and "
+        "their values may be off by a factor"
+    )
+    GAINS_OF_SOME_FILES = _doubt(
+        "only some of the files of one view state gains or a scale: numbers of the others are taken as stored"
+    )
+    EXPOSURE_NOT_UNDERSTOOD = _doubt("{entry} is {value}, which is not understood: exposures may differ")
+    GAIN_PARTS_MISFIT = _doubt("{entries} are lists of different lengths: exposures may differ")
+    BAND_GAINS_UNKNOWN = _doubt(
+        "the gain is known of some bands and not of {lacking}: exposures are not compared; write it into all files, or "
+        "none"
+    )
+    BAND_GAINS_TAKEN_AS_ONE = _doubt(
+        "the gain is 1 in some bands and not known of {lacking}, where it is taken for 1, too: values may be off by a "
+        "factor"
+    )
+    BAND_EXPOSURES_UNKNOWN = _doubt(
+        "one exposure time and gain is not known of every band: exposures are not compared"
+    )
+    BAND_F_NUMBERS_UNKNOWN = _doubt(
+        "the f-number of the lens is known of some bands and not of {lacking}: exposures are compared without it"
+    )
+
+    # Files: bands.
+    BAND_LIST_MISFIT = _doubt("{what} are left out: {number} for {bands} bands")
+    BAND_LIST_NO_NUMBERS = _doubt("{what} are not a list of numbers ({error}) and are left out")
+    BAND_LIST_NOT_FINITE = _doubt("{what} are left out: that of band {band} (from 0) is {value}")
+    WAVELENGTHS_COUNT_BANDS = _doubt(
+        "{entry}: {low} to {high} with no unit count the bands and are no wavelengths; correct them there, or give "
+        "them yourself (--wavelengths of unmix-process)"
+    )
+    WAVELENGTHS_WITHOUT_UNIT = _doubt(
+        "{entry}: {low} to {high} with {unit} can't be brought to nm; correct them there, or give them yourself "
+        "(--wavelengths of unmix-process)"
+    )
+    WAVELENGTHS_IMPOSSIBLE = _doubt(
+        "{entry}: {low} to {high} can't be in {unit}; correct them there, or give them yourself (--wavelengths of "
+        "unmix-process)"
+    )
+    WAVELENGTH_REPEATED = _doubt("two bands beside each other have the same wavelength")
+    WIDTHS_ALONE = _doubt("FWHM are left out, as the file gives no wavelengths beside them")
+    WIDTHS_NOT_POSITIVE = _doubt("FWHM are left out: they go down to {low}")
+    WIDTHS_IMPOSSIBLE = _doubt("FWHM are left out: they would be {range}")
+    WIDTHS_IN_OTHER_UNIT = _doubt(
+        "FWHM: {low} to {high} taken as {unit}, as they can't be in the unit of the wavelengths"
+    )
 
     # Views that are left out.
     VIEW_BLACK = _wrong(
@@ -188,6 +301,9 @@ class Code(Enum):
         return self.kind is Kind.WRONG
 
 
+AXES_IN_DOUBT = (Code.AXES_AMBIGUOUS, Code.AXES_UNLIKELY)
+
+
 class _Sentences(string.Formatter):
     """Sequences as their first few items, numbers of things in words."""
 
@@ -218,10 +334,11 @@ class Remark:
     def sentence(self) -> str:
         """For people.
 
-        >>> Remark.of(Code.FILE_WARNING, ["a.hdr", "b.hdr"], text="cut short").sentence
-        'a.hdr, b.hdr: cut short'
+        >>> Remark.of(Code.BYTES_LEFT, ["a.hdr", "b.hdr"], left=3).sentence
+        'a.hdr, b.hdr: 3 bytes more than the header describes'
         """
-        known = {"where": self.where, "count": len(self.where), **self.values}
+        files = f"{name_some(list(self.where))}: " if self.where else ""
+        known = {"where": self.where, "count": len(self.where), "files": files, **self.values}
         return _Sentences().vformat(self.code.template, (), known)
 
     def to_json(self) -> dict[str, Any]:
@@ -232,7 +349,7 @@ class Remark:
 def merged(remarks: Iterable[Remark]) -> list[Remark]:
     """Each remark once, in their order; of equal ones, one that names all views or files.
 
-    >>> twice = [Remark.of(Code.FILE_WARNING, [name], text="cut short") for name in "ab"]
+    >>> twice = [Remark.of(Code.BYTES_LEFT, [name], left=3) for name in "ab"]
     >>> [remark.where for remark in merged(twice)]
     [('a', 'b')]
     """
@@ -258,6 +375,8 @@ def report_text(
     decided: Sequence[Decision] = (),
 ) -> str:
     """One page of text: what looks wrong, what was decided, what was measured, what was done."""
+    from unmix_plugin.engine.decisions import decision_table
+
     wrong, parts = wrong or ["none of the checks found a fault"], [title, ""]
     for heading, lines in zip(Kind, (wrong, measured, done), strict=True):
         parts.append(heading.value)

@@ -93,15 +93,16 @@ def image(argv: list[str]) -> None:
 def _say_what_was_read(opened: Cube, mask: np.ndarray, num_bands: int, is_compared: bool) -> None:
     """Size, doubts and notes of a file, and what of it is left out."""
     from unmix_plugin.captures.calibration.references import stated_reflectance
+    from unmix_plugin.captures.report import Kind, sentences
     from unmix_plugin.trained.run_materials import LIGHT_UNKNOWN
 
     size = f"{mask.shape[0]} x {mask.shape[1]} pixels, {counted(num_bands, 'band')}"
     tell(f"{opened.path}: {size}")
-    for warning in opened.warnings:
+    for warning in sentences(opened.remarks, Kind.WRONG):
         tell(f"looks wrong: {warning}")
     if opened.is_geotiff:
         tell("note: the maps do not keep the geo-reference of a TIFF; their pixels are those of the file")
-    for note in opened.notes:
+    for note in sentences(opened.remarks, Kind.DONE):
         tell(f"note: {note}")
     if opened.is_srgb:
         tell("the picture is taken as sRGB and brought to linear light")

@@ -68,7 +68,8 @@ class EnviLayout:
     """bsq, bil or bip."""
     offset: int
     """Bytes before the first number."""
-    notes: tuple[str, ...] = ()
+    is_order_assumed: bool = False
+    """Whether the header does not say the byte order, which is taken as little-endian."""
 
     @property
     def num_bytes(self) -> int:
@@ -194,14 +195,14 @@ def read_layout(header: Mapping[str, str]) -> EnviLayout:
                 f"'{key}' is {header[key]}; expected 0: write the image without bytes between frames"
             )
     height, width, num_bands = image_size(header)
-    code, notes = _count(header, "data type"), ()
+    code, is_assumed = _count(header, "data type"), False
     if code not in _TYPES:
         found = f"{code}, complex numbers" if code in (6, 9) else str(code)
         known = ", ".join(f"{code} ({np.dtype(name).name})" for code, name in _TYPES.items())
         raise ValueError(f"'data type' is {found}; expected one of {known}")
     kind = np.dtype(_TYPES[code])
     if "byte order" not in header and kind.itemsize > 1:
-        notes = ("the header has no byte order; taken as little-endian",)
+        is_assumed = True
     order = _count(header, "byte order", default="0")
     if order > 1:
         raise ValueError(f"'byte order' is {order}; expected 0 (little-endian) or 1 (big-endian)")
@@ -212,7 +213,7 @@ def read_layout(header: Mapping[str, str]) -> EnviLayout:
         raise ValueError(f"'interleave' is {found}; expected bsq, bil or bip: correct the header")
     offset = _count(header, "header offset", default="0")
     dtype = kind.newbyteorder(">" if order else "<")
-    return EnviLayout((height, width, num_bands), dtype, interleave.lower(), offset, notes)
+    return EnviLayout((height, width, num_bands), dtype, interleave.lower(), offset, is_assumed)
 
 
 def image_size(header: Mapping[str, str]) -> tuple[int, int, int]:

@@ -44,18 +44,18 @@ pytestmark = pytest.mark.usefixtures("no_contact_sheet")
     ],
 )
 def test_times_by_any_name_in_any_unit(entries, seconds):
-    warnings: list[str] = []
-    assert state_exposure(entries, "header field", warnings).to_json()["exposure_s"] == pytest.approx(seconds)
-    assert not warnings
+    remarks: list[Remark] = []
+    assert state_exposure(entries, "header field", remarks).to_json()["exposure_s"] == pytest.approx(seconds)
+    assert not remarks
 
 
 @pytest.mark.parametrize(
     ("name", "text"), [("exposure", "-1.5 EV"), ("exposure", "1" * 100_000 + "!"), ("gain", "99999 dB")]
 )
 def test_what_is_not_understood_is_said(name, text):
-    warnings: list[str] = []
-    assert state_exposure({name: text}, "header field", warnings) == Exposure()
-    assert f"header field '{name}' is '{text[:60]}', which is not understood" in warnings[0]
+    remarks: list[Remark] = []
+    assert state_exposure({name: text}, "header field", remarks) == Exposure()
+    assert f"header field '{name}' is '{text[:60]}', which is not understood" in remarks[0].sentence
 
 
 @pytest.mark.parametrize("faulty", ["f/2.8", (28, 10), float("inf"), 0.0, -1.0, None])
@@ -87,10 +87,10 @@ def test_a_faulty_tag_of_exif_leaves_the_others_of_an_exposure(faulty):
     ],
 )
 def test_gains_of_parts_of_a_camera_multiply_each_other_and_a_plain_one_is_the_whole(entries, gain):
-    warnings: list[str] = []
-    facts = state_exposure(entries, "header field", warnings).to_json()
+    remarks: list[Remark] = []
+    facts = state_exposure(entries, "header field", remarks).to_json()
     assert facts.get("gain") == (pytest.approx(gain, rel=1e-4) if gain else None)
-    assert len(warnings) == (gain is None)
+    assert len(remarks) == (gain is None)
 
 
 def exposed(time, gain=1.0, source="header field 'tint'", assumed="milliseconds"):

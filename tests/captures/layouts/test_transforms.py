@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from tests.captures.capture_factory import process
-from tests.captures.file_factory import check_file, present, write_envi
+from tests.captures.file_factory import check_file, present, warnings_of, write_envi
 from tests.captures.layouts.data_sets import (
     LENS,
     PLAIN,
@@ -190,7 +190,7 @@ def test_wavelengths_settle_which_axis_is_that_of_bands(tmp_path):
         np.save(path, np.random.default_rng(0).random((6, 8, 40)))  # more bands than rows
     for view in find_unmix_nerf(tmp_path, PLAIN).views:
         assert view.cube.shape == (6, 8, 40)
-        assert view.cube.warnings == ()
+        assert warnings_of(view.cube) == []
 
 
 def with_path(text):

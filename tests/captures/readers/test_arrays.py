@@ -11,7 +11,14 @@ import scipy.io
 import scipy.sparse
 import torch
 
-from tests.captures.file_factory import ARRAY_WRITERS, check_file, present, rows_and_bands_of
+from tests.captures.file_factory import (
+    ARRAY_WRITERS,
+    check_file,
+    notes_of,
+    present,
+    rows_and_bands_of,
+    warnings_of,
+)
 from unmix_plugin.captures.calibration.references import find_missing, finished_by, stated_reflectance
 from unmix_plugin.captures.cube import ReadOptions
 from unmix_plugin.captures.readers import containers
@@ -81,7 +88,7 @@ def test_other_variables_of_matlab_are_passed_over(tmp_path, do_compression):
     scipy.io.savemat(tmp_path / "a.mat", {**others, "z_cube": doubles}, do_compression=do_compression)
     file = open_spectral_file(tmp_path / "a.mat", ReadOptions(dataset="z_cube"))
     check_file(file, dtype=np.dtype("f8"), values=doubles, nm=NM, bad=[1])
-    assert "not used: a_text, a_structure, b_cells" in file.notes[0]
+    assert "not used: a_text, a_structure, b_cells" in notes_of(file)[0]
     with pytest.raises(CaptureError, match=r"e_logical .*, wl \(5, 1\), bbl .*, z_cube \(8, 9, 5\)$"):
         open_spectral_file(tmp_path / "a.mat")
 
@@ -255,7 +262,7 @@ def test_what_numbers_stand_for_is_never_passed_over_where_it_cannot_be_read(tmp
     with pytest.raises(CaptureError, match="'scale_factor' is of a type that can't be read: without it all"):
         open_spectral_file(write_unreadable(tmp_path / "a.h5", "scale_factor"))
     file = open_spectral_file(write_unreadable(tmp_path / "a.h5", "_FillValue", "wavelengths", "remark"))
-    assert [text for text in file.warnings if "can't be read: not used" in text] == [
+    assert [text for text in warnings_of(file) if "can't be read: not used" in text] == [
         f"attribute '{name}' can't be read: not used" for name in ("_FillValue", "wavelengths")
     ]
     with pytest.raises(CaptureError, match="'add_offset' is 'unknown', no number"):
@@ -313,8 +320,8 @@ def test_parts_of_hdf5_that_were_never_written_are_missing(
             image[:4] = 7
     opened = open_spectral_file(tmp_path / "a.h5")
     assert tuple(number for number in opened.no_data if np.isfinite(number)) == no_data
-    told = [text for text in opened.warnings if "never written" in text]
-    assert len(told) == warnings, opened.warnings
+    told = [text for text in warnings_of(opened) if "never written" in text]
+    assert len(told) == warnings, warnings_of(opened)
     missing = find_missing(opened.read(), opened)
     assert missing[4:].all()
     assert missing[:4].any() == (chunks is None)

@@ -6,7 +6,14 @@ import pytest
 import tifffile
 from PIL import Image
 
-from tests.captures.file_factory import check_file, header_text, present, rows_and_bands_of, write_band_file
+from tests.captures.file_factory import (
+    check_file,
+    header_text,
+    present,
+    rows_and_bands_of,
+    warnings_of,
+    write_band_file,
+)
 from tests.captures.test_camera_tags import EXIF, MICASENSE
 from unmix_plugin.captures.calibration.references import find_missing, finished_by
 from unmix_plugin.captures.readers.opening import open_spectral_file
@@ -98,7 +105,7 @@ def test_a_band_in_a_folder_has_what_files_beside_it_say(tmp_path):
     np.testing.assert_allclose(present(file.linear).offsets, [-0.1, -0.1])
     expected = np.array([[True] * 4, [False, True, False, False], [False, True, False, False]])
     np.testing.assert_array_equal(find_missing(file.read(), file), expected)
-    assert (file.dtype, file.warnings) == (np.uint16, ())
+    assert (file.dtype, warnings_of(file)) == (np.uint16, [])
     rows, bands = slice(1, 3), np.array([0])
     assert not find_missing(file.read(rows, bands), file, rows, bands).any()
 

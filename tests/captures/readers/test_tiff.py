@@ -15,6 +15,7 @@ from tests.captures.file_factory import (
     gdal_tag,
     present,
     rows_and_bands_of,
+    warnings_of,
     xmp_packet,
 )
 from unmix_plugin.captures import numbers
@@ -264,7 +265,7 @@ def test_tiles_that_are_left_out_in_the_file_are_missing(
     missing = find_missing(opened.read(), opened)
     assert (opened.no_data, missing[32:, 16:32].all(), missing.sum()) == (no_data, True, 32 * 16)
     np.testing.assert_array_equal(opened.read()[~missing], image[~missing])
-    assert any("6 blocks of the image left out" in text for text in opened.warnings) == is_told
+    assert any("6 blocks of the image left out" in text for text in warnings_of(opened)) == is_told
 
 
 @pytest.mark.parametrize("options", [{}, {"compression": "zlib", "tile": (16, 32)}])

@@ -44,6 +44,7 @@ from unmix_plugin.captures.poses.reading import read_poses, read_transforms
 from unmix_plugin.captures.readers.band_files import stack_bands
 from unmix_plugin.captures.readers.exr import channel_names
 from unmix_plugin.captures.readers.opening import open_spectral_file
+from unmix_plugin.captures.report import AXES_IN_DOUBT
 from unmix_plugin.errors import CaptureError, counted
 from unmix_plugin.formats.json_values import describe, read_numbers
 from unmix_plugin.scenes.folder import CUBE_KEY, parse_transforms, read_frame_keys, read_scene_keys
@@ -310,7 +311,7 @@ def _open_cube(path: Path, stated: _StatedCube, options: ReadOptions) -> Cube:
     """A cube; numbers of 8 bits stand for fractions of 255, unless another number is said to stand for 1."""
     file, bands = open_spectral_file(path, options), stated.bands
     count = 0 if bands is None or bands.wavelengths_nm is None else len(bands.wavelengths_nm)
-    if count == file.shape[2] and file.warnings:
+    if count == file.shape[2] and any(one.code in AXES_IN_DOUBT for one in file.remarks):
         # transforms.json settles which axis is that of bands, which the array alone leaves in doubt.
         sure = open_spectral_file(path, replace(options, axes="yxb"))
         file = sure if sure.shape == file.shape and options.axes is None else file

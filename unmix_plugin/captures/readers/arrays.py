@@ -40,7 +40,8 @@ from unmix_plugin.captures.fields import (
 )
 from unmix_plugin.captures.names import common_length
 from unmix_plugin.captures.numbers import Axes, Block, Numbers
-from unmix_plugin.errors import CaptureError, name_some
+from unmix_plugin.captures.report import Code, Remark
+from unmix_plugin.errors import CaptureError
 from unmix_plugin.limits import MOST_BANDS, MOST_TEXT_BYTES, allow_parts
 
 _SIDES = ("nrow", "nrows", "ncol", "ncols")
@@ -130,18 +131,18 @@ def image_of_arrays(path: Path, reader: str, arrays: Sequence[FoundArray], optio
         names = (name.lower().rpartition("/")[2] for name in image.dimensions or ())
         named: Any = "".join(_AXES.get(name, "?") for name in names)
         fixed = named if sorted(named) == ["b", "x", "y"] else None
-    warnings: list[str] = []
+    remarks: list[Remark] = []
     entries = _entries(arrays, image)
     stated = state_bands(entries, _WHERE)
     given = options.wavelengths_nm if options.wavelengths_nm is not None else stated.centres
-    axes = choose_axes(shape, fixed, None if given is None else len(given), warnings)
+    axes = choose_axes(shape, fixed, None if given is None else len(given), remarks)
     of_image = image_shape(shape, axes)
     allow_parts(path, of_image[2], "bands", CaptureError, MOST_BANDS)
-    bands = _without_windows(check_bands(stated, of_image[2], warnings), image)
-    linear = _linear(path, image, of_image[2], warnings)
-    warnings += _unread(path, image)
+    bands = _without_windows(check_bands(stated, of_image[2], remarks), image)
+    linear = _linear(path, image, of_image[2], remarks)
+    remarks += _unread(path, image)
     applied = () if linear is None else linear.entries
-    exposure = state_exposure({key: entries[key] for key in entries if key not in applied}, _WHERE, warnings)
+    exposure = state_exposure({key: entries[key] for key in entries if key not in applied}, _WHERE, remarks)
     dtype, no_data, valid = _measured_numbers(image, linear)
 
     others = [
@@ -151,6 +152,8 @@ def image_of_arrays(path: Path, reader: str, arrays: Sequence[FoundArray], optio
         or not (one.own_name in (*_AXES, *_SIDES) or is_exposure(one.own_name) or _lists_bands(one))
         if one is not image
     ]
+    if others:
+        remarks.append(Remark.of(Code.ARRAYS_UNUSED, names=others))
     return Cube(
         path=path,
         reader=reader,
@@ -161,8 +164,7 @@ def image_of_arrays(path: Path, reader: str, arrays: Sequence[FoundArray], optio
         linear=linear,
         no_data=no_data,
         valid_range=valid,
-        notes=(f"also in the file, and not used: {name_some(others)}",) if others else (),
-        warnings=tuple(warnings),
+        remarks=tuple(remarks),
         exposure=exposure,
         dataset=image.name if len(arrays) > 1 else "",
         others={"axes": axes},
@@ -182,7 +184,7 @@ def choose_axes(
     shape: tuple[int, ...],
     given: Axes | None,
     num_wavelengths: int | None,
-    warnings: list[str],
+    remarks: list[Remark],
     default: Axes = "yxb",
 ) -> Axes:
     """Axes of a 3-D array.
@@ -202,15 +204,15 @@ def choose_axes(
         fitting.insert(0, _WITH_BANDS_AT.index(default))
     if fitting:
         if len(set(fitting)) > 1:
-            several = f"{num_wavelengths} wavelengths fit several axes of {shape}"
-            warnings.append(f"{several}; bands are taken to be axis {fitting[0]}")
+            facts = {"number": num_wavelengths, "shape": str(shape), "axis": fitting[0]}
+            remarks.append(Remark.of(Code.AXES_AMBIGUOUS, **facts))
         return _WITH_BANDS_AT[fitting[0]]
     bands = _WITH_BANDS_AT.index(default)
     shortest = int(np.argmin(shape))
     if shape[shortest] < shape[bands]:
         other = "byx" if default == "yxb" else "yxb"
-        taken = f"bands are taken to be axis {bands} of {shape}, though axis {shortest} is the shortest"
-        warnings.append(f"{taken}; if that is wrong, say which axis is which (--axes {other})")
+        facts = {"axis": bands, "shape": str(shape), "shortest": shortest, "other": other}
+        remarks.append(Remark.of(Code.AXES_UNLIKELY, **facts))
     return default
 
 
@@ -365,7 +367,7 @@ def _unpacked(array: FoundArray) -> list[Any]:
     return (stored if offset is None else stored + offset).tolist()
 
 
-def _linear(path: Path, image: FoundArray, num_bands: int, warnings: list[str]) -> Linear | None:
+def _linear(path: Path, image: FoundArray, num_bands: int, remarks: list[Remark]) -> Linear | None:
     """Gains and offsets among the attributes of an image, or those of its level of PRISMA."""
     found = {key: _numbers(value) for key, value in image.all_attributes.items()}
     plain = plain_names({key: numbers for key, numbers in found.items() if numbers})
@@ -375,7 +377,7 @@ def _linear(path: Path, image: FoundArray, num_bands: int, warnings: list[str]) 
     named = plain_names(found)
     if "scale_factor" in named:  # before the factor of reflectances
         found.pop(named.get("reflectance_scale_factor", ""), None)
-    linear = state_linear(path, num_bands, found, "attribute", Format.ARRAYS, warnings)
+    linear = state_linear(path, num_bands, found, "attribute", Format.ARRAYS, remarks)
     return linear or _prisma(path, image, num_bands)
 
 
@@ -401,10 +403,10 @@ def _prisma(path: Path, image: FoundArray, num_bands: int) -> Linear | None:
     )
 
 
-def _unread(path: Path, image: FoundArray) -> list[str]:
-    """Warnings of attributes that say what stands for no measurement, or of bands, and that are no numbers or can't be
+def _unread(path: Path, image: FoundArray) -> list[Remark]:
+    """Remarks on attributes that say what stands for no measurement, or of bands, and that are no numbers or can't be
     read at all. Raises CaptureError: what numbers are to be multiplied by can't be read."""
-    attributes, warnings = image.all_attributes, []
+    attributes, remarks = image.all_attributes, []
     for name, key in plain_names(attributes).items():
         value = attributes[key]
         is_read = value is not UNREADABLE
@@ -421,9 +423,13 @@ def _unread(path: Path, image: FoundArray) -> list[str]:
             )
         is_number = is_own or name in (*_NO_DATA, *_VALID)
         if (is_number and not _numbers(value)) or (says_bands(name) and not is_read):
-            found = f"is {str(value)[:40]!r}, no number" if is_read else "can't be read"
-            warnings.append(f"attribute '{key}' {found}: not used")
-    return warnings
+            entry, shown = f"attribute '{key}'", repr(str(value)[:40])
+            remarks.append(
+                Remark.of(Code.ENTRY_NO_NUMBER, entry=entry, value=shown)
+                if is_read
+                else Remark.of(Code.ENTRY_UNREADABLE, entry=entry)
+            )
+    return remarks
 
 
 def _numbers(value: Any) -> list[float]:

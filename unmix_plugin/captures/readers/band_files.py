@@ -13,8 +13,9 @@ import numpy as np
 from unmix_plugin.captures.camera_tags import radiometric_model
 from unmix_plugin.captures.cube import BandTable, Cube, Exposure, Factor, Linear
 from unmix_plugin.captures.names import natural_order
+from unmix_plugin.captures.report import Code, Remark, merged
 from unmix_plugin.captures.wavelengths import wavelengths_in_names
-from unmix_plugin.errors import CaptureError, name_some
+from unmix_plugin.errors import CaptureError
 from unmix_plugin.limits import allow_parts
 
 _KINDS = {".tif": "TIFF", ".tiff": "TIFF", ".png": "PNG", ".exr": "OpenEXR", ".jpg": "JPEG", ".jpeg": "JPEG"}
@@ -69,9 +70,11 @@ def open_band_folder(folder: Path, open_band: Callable[[Path], Cube]) -> Cube:
         widths = stack.bands.fwhm_nm if named[2] is None else named[2][order]
         table = replace(stack.bands, wavelengths_nm=named[0][order], evidence=evidence, fwhm_nm=widths)
         stack = replace(stack, bands=table)
-    noun = "picture of another kind" if others == 1 else "pictures of other kinds"
-    notes = (f"{others} {noun} than {kind} in the folder left out",) if others else ()
-    return replace(stack, interleave="bsq", notes=stack.notes + notes)
+    if others:
+        pictures = "picture of another kind" if others == 1 else "pictures of other kinds"
+        facts = {"number": others, "pictures": pictures, "kind": kind}
+        stack = stack.remarking(Remark.of(Code.BANDS_OF_OTHER_KINDS, **facts))
+    return replace(stack, interleave="bsq")
 
 
 def stack_bands(parts: Sequence[Cube], path: Path) -> Cube:
@@ -93,11 +96,10 @@ def stack_bands(parts: Sequence[Cube], path: Path) -> Cube:
                 f"{part.path} has {part.shape[0]} x {part.shape[1]} pixels; expected the "
                 f"{first.shape[0]} x {first.shape[1]} of {first.path}: the bands of one view have one size"
             )
-    warnings = [*dict.fromkeys(warning for part in parts for warning in part.warnings)]
+    remarks = merged(remark for part in parts for remark in part.remarks)
     stated = [part.linear for part in parts if part.linear is not None]
     if 0 < len(stated) < len(parts):
-        said = "only some of the files of one view state gains or a scale"
-        warnings.append(f"{said}: numbers of the others are taken as stored")
+        remarks.append(Remark.of(Code.GAINS_OF_SOME_FILES))
     each = [part.linear or Linear(np.ones(1), np.zeros(1), "") for part in parts]
     gains, offsets = (np.concatenate([getattr(one, name) for one in each]) for name in ("gains", "offsets"))
     own = [replace(part, no_data=tuple(number for number in part.no_data if number != 0)) for part in parts]
@@ -115,11 +117,10 @@ def stack_bands(parts: Sequence[Cube], path: Path) -> Cube:
         linear=replace(stated[0], gains=gains, offsets=offsets) if stated else None,
         no_data=tuple(dict.fromkeys(of_all)),
         valid_range=None if differ else first.valid_range,
-        exposure=_exposure_of_bands(parts, warnings),
+        exposure=_exposure_of_bands(parts, remarks),
         **{name: _shared(parts, name) for name in _SHARED},
         others=_other_entries(parts),
-        notes=tuple(dict.fromkeys(note for part in parts for note in part.notes)),
-        warnings=tuple(warnings),
+        remarks=tuple(remarks),
         sources=tuple(source for part in parts for source in part.files),
         dark_lines=0,
         masks=(),
@@ -170,7 +171,7 @@ def _other_entries(parts: Sequence[Cube]) -> dict[str, Any]:
     return same | ({"parts": differ} if any(differ) else {})
 
 
-def _exposure_of_bands(parts: Sequence[Cube], warnings: list[str]) -> Exposure:
+def _exposure_of_bands(parts: Sequence[Cube], remarks: list[Remark]) -> Exposure:
     """That of all parts where they have the same; otherwise time times gain of each band, with the f-number of all, or
     nothing where they are not known."""
     each = [part.exposure for part in parts]
@@ -182,24 +183,18 @@ def _exposure_of_bands(parts: Sequence[Cube], warnings: list[str]) -> Exposure:
     is_exposed = any(times)
     has_gains = is_exposed and 0 < len(without) < len(parts)
     if has_gains and any(gain != (1.0,) for gain in gains):
-        unknown = f"the gain is known of some bands and not of {name_some(without)}"
-        warnings.append(f"{unknown}: exposures are not compared; write it into all files, or none")
+        remarks.append(Remark.of(Code.BAND_GAINS_UNKNOWN, lacking=without))
         return Exposure()
     is_partial = is_exposed and 0 < len(lacking) < len(parts)
     if is_partial:
         f_numbers = [1.0] * len(parts)
     is_same = len({*zip(times, gains, f_numbers, strict=True)}) == 1
     if not is_same and not all(len(numbers) == 1 for numbers in (*times, *gains)):
-        unknown = "one exposure time and gain is not known of every band: exposures are not compared"
-        warnings += [unknown] if is_exposed else []
+        remarks += [Remark.of(Code.BAND_EXPOSURES_UNKNOWN)] if is_exposed else []
         return Exposure()
     if has_gains:
-        taken = (
-            f"the gain is 1 in some bands and not known of {name_some(without)}, where it is taken for 1, too"
-        )
-        warnings.append(f"{taken}: values may be off by a factor")
-    unknown = f"the f-number of the lens is known of some bands and not of {name_some(lacking)}"
-    warnings += [f"{unknown}: exposures are compared without it"] if is_partial else []
+        remarks.append(Remark.of(Code.BAND_GAINS_TAKEN_AS_ONE, lacking=without))
+    remarks += [Remark.of(Code.BAND_F_NUMBERS_UNKNOWN, lacking=lacking)] if is_partial else []
     f_number = None if lacking else f_numbers[0]
     if is_same:
         return Exposure(each[0].time, None if without else each[0].gain, f_number)

@@ -31,7 +31,8 @@ from unmix_plugin.captures.readers.arrays import (
     describes_image,
     image_of_arrays,
 )
-from unmix_plugin.errors import CaptureError, counted
+from unmix_plugin.captures.report import Code, Remark
+from unmix_plugin.errors import CaptureError
 from unmix_plugin.limits import (
     MOST_TEXT_BYTES,
     allow_decoded,
@@ -190,11 +191,8 @@ def _with_fill(opened: Cube, image: Any) -> Cube:
     if not absent or fill in opened.no_data or not np.isfinite(fill):
         return opened
     taken = "in all bands " * (fill == 0) + "count as not measured"
-    warning = (
-        f"{counted(absent, 'chunk')} of the image never written, and no attribute says what marks them: pixels of "
-        f"{fill:g} {taken}; if these were measured, write the file in full"
-    )
-    return replace(opened, no_data=(*opened.no_data, fill), warnings=(*opened.warnings, warning))
+    remark = Remark.of(Code.CHUNKS_ABSENT, chunks=absent, fill=f"{fill:g}", taken=taken)
+    return replace(opened, no_data=(*opened.no_data, fill)).remarking(remark)
 
 
 def _found_in_hdf5(

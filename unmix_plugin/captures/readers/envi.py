@@ -16,7 +16,8 @@ from unmix_plugin.captures.fields import (
     state_linear,
 )
 from unmix_plugin.captures.numbers import Mapped, Numbers
-from unmix_plugin.errors import CaptureError, counted
+from unmix_plugin.captures.report import Code, Remark
+from unmix_plugin.errors import CaptureError
 from unmix_plugin.formats.envi import (
     MAP_KEYS,
     EnviLayout,
@@ -40,10 +41,6 @@ _COMPRESSED = {b"\x1f\x8b": "gzip", b"BZh": "bzip2", b"PK\x03\x04": "zip", b"\xf
 _DARK_START = "autodarkstartline"
 """Where cameras of Specim close the shutter at the end of a capture: the first dark line, from 0. Source: NEODAAS,
 run_subtract_darkframes, and ARSF, apl."""
-_DARK_LINES = (
-    f"the lines from '{_DARK_START}' on were taken with the shutter closed: they are no part of the image, but the "
-    "dark frame of raw numbers that have no other"
-)
 
 _OF_RESONON = {"shutter", "gain", "framerate"}
 _OF_BANDS = ("wavelength", "wavelength units", "fwhm", "bbl", "band names")
@@ -69,7 +66,8 @@ def open_envi(path: Path, _: ReadOptions) -> Cube:
             data_path = data_beside(header_path, layout.num_bytes, f".{layout.interleave}")
     except ValueError as error:
         raise CaptureError(f"{header_path}: {error}") from error
-    size_warnings = _check_size(header_path, data_path, layout)
+    remarks = [Remark.of(Code.BYTE_ORDER_ASSUMED)] if layout.is_order_assumed else []
+    remarks += _check_size(header_path, data_path, layout)
     lengths = dict(zip("yxb", layout.shape, strict=True))
     stored = tuple(lengths[axis] for axis in layout.axes)
     numbers = Mapped(data_path, layout.dtype, stored, layout.offset)
@@ -80,7 +78,7 @@ def open_envi(path: Path, _: ReadOptions) -> Cube:
         dtype=layout.dtype,
         numbers=Numbers((numbers,), stored, layout.axes, layout.dtype),
         interleave=layout.interleave,
-        warnings=layout.notes + size_warnings,
+        remarks=tuple(remarks),
         sources=(data_path,),
     )
     return _described(plain, header_path, header)
@@ -102,8 +100,8 @@ def described_by_header(file: Cube) -> Cube:
         raise CaptureError(f"{header_path}: {error}") from error
     if shape != file.shape:
         expected, found = (" x ".join(map(str, size)) for size in (file.shape, shape))
-        warning = f"{header_path.name} describes {found} rows, columns and bands, the image has {expected}: not used"
-        return replace(file, warnings=(*file.warnings, warning))
+        named = {"header": header_path.name, "found": found, "size": expected}
+        return file.remarking(Remark.of(Code.HEADER_OF_OTHER_SIZE, **named))
     described = _described(file, header_path, header)
     return replace(described, sources=(*file.sources, header_path))
 
@@ -128,44 +126,41 @@ def described_image(header_path: Path) -> Path | None:
 
 def _described(file: Cube, header_path: Path, header: dict[str, str]) -> Cube:
     """The file with bands, gains, exposure and other facts of a header; what the file says itself fills gaps."""
-    num_bands, own, warnings = file.shape[2], file.bands, list(file.warnings)
+    num_bands, own, remarks = file.shape[2], file.bands, list(file.remarks)
     if unread := header.pop("", "").splitlines():
-        warnings.append(
-            f"{counted(len(unread), 'line')} of the header not read for want of '=': {unread[0][:80]!r}"
-        )
+        first = repr(unread[0][:80])
+        remarks.append(Remark.of(Code.HEADER_LINES_UNREAD, lines=len(unread), first=first))
     stated = state_bands({key: header[key] for key in _OF_BANDS if key in header}, "header field")
-    bands = check_bands(stated, num_bands, warnings)
+    bands = check_bands(stated, num_bands, remarks)
     if bands.wavelengths_nm is None and own.wavelengths_nm is not None:
         bands = replace(own, bad=own.bad if bands.bad is None else bands.bad)
-    linear = state_linear(header_path, num_bands, header, "header field", Format.ENVI, warnings)
+    linear = state_linear(header_path, num_bands, header, "header field", Format.ENVI, remarks)
     factors = [key for key in header if key.endswith("scale factor") and key != _FACTOR]
     factors = [key for key in factors if header[key].strip("{} ") not in ("1", "1.0")]
-    warnings += [f"'{key}' is {header[key]}: not applied, as ENVI knows no such field" for key in factors]
+    remarks += [Remark.of(Code.FACTOR_NOT_APPLIED, entry=key, value=header[key]) for key in factors]
     # Of Resonon, which writes decibels without saying so. Source: massipipe, RadianceConverter.
     in_db = header.keys() >= _OF_RESONON and "gain unit" not in header
-    exposure = state_exposure(header | ({"gain unit": "dB"} if in_db else {}), "header field", warnings)
+    exposure = state_exposure(header | ({"gain unit": "dB"} if in_db else {}), "header field", remarks)
     if in_db and exposure.gain is not None:
         source = f"{exposure.gain.source}, taken as decibels, as Resonon writes"
         exposure = replace(exposure, gain=replace(exposure.gain, source=source))
-    start, lines = (
-        _numbers(header, _DARK_START, "dark lines may be left in the image", warnings),
-        file.shape[0],
-    )
+    start, lines = _numbers(header, _DARK_START, Code.DARK_LINES_NO_NUMBER, remarks), file.shape[0]
     dark_lines = lines - int(start[0]) if len(start) == 1 and 1 <= start[0] < lines else 0
     if len(start) > 1:
-        warnings.append(f"'{_DARK_START}' has {len(start)} numbers: dark lines may be left in the image")
-    no_data = _numbers(header, "data ignore value", "not used", warnings)
+        remarks.append(Remark.of(Code.DARK_LINES_SEVERAL, entry=_DARK_START, count_stated=len(start)))
+    no_data = _numbers(header, "data ignore value", Code.NO_DATA_NO_NUMBER, remarks)
+    if dark_lines:
+        remarks.append(Remark.of(Code.DARK_LINES_APART, entry=_DARK_START))
     shown = {key: value for key, value in header.items() if len(value) < _SHOWN_LENGTH}
     on_map = {key: " ".join(header[key].split()) for key in MAP_KEYS if header.get(key)}
     return replace(
         file,
         shape=(lines - dark_lines, *file.shape[1:]),
         dark_lines=dark_lines,
-        notes=(*file.notes, _DARK_LINES) if dark_lines else file.notes,
         bands=bands if bands.names is not None else replace(bands, names=own.names),
         linear=linear or file.linear,
         no_data=tuple(dict.fromkeys((*no_data, *file.no_data))),
-        warnings=tuple(warnings),
+        remarks=tuple(remarks),
         exposure=Exposure(
             exposure.time or file.exposure.time,
             exposure.gain or file.exposure.gain,
@@ -177,20 +172,20 @@ def _described(file: Cube, header_path: Path, header: dict[str, str]) -> Cube:
     )
 
 
-def _numbers(header: dict[str, str], key: str, otherwise: str, warnings: list[str]) -> list[float]:
-    """Numbers of an entry, a comment behind them cut off; none with a warning where it is something else."""
+def _numbers(header: dict[str, str], key: str, otherwise: Code, remarks: list[Remark]) -> list[float]:
+    """Numbers of an entry, a comment behind them cut off; none with a remark where it is something else."""
     try:
         return [float(item) for item in listed(header.get(key, "").partition(";")[0])]
     except ValueError:
-        warnings.append(f"'{key}' is {header[key]}, no number: {otherwise}")
+        remarks.append(Remark.of(otherwise, entry=key, value=header[key]))
         return []
 
 
-def _check_size(header_path: Path, data_path: Path, layout: EnviLayout) -> tuple[str, ...]:
-    """A warning if there is more than the header describes; less, or compressed numbers, are refused."""
+def _check_size(header_path: Path, data_path: Path, layout: EnviLayout) -> list[Remark]:
+    """A remark if there is more than the header describes; less, or compressed numbers, are refused."""
     found, needed = data_path.stat().st_size, layout.num_bytes
     if found >= needed:
-        return (f"{found - needed} bytes more than the header describes",) if found > needed else ()
+        return [Remark.of(Code.BYTES_LEFT, left=found - needed)] if found > needed else []
     with data_path.open("rb") as file:
         begin = file.read(6)
     kind = next((kind for magic, kind in _COMPRESSED.items() if begin.startswith(magic)), None)

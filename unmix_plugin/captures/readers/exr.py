@@ -30,6 +30,7 @@ from unmix_plugin.captures.cube import BandTable, Cube, Exposure, Factor, ReadOp
 from unmix_plugin.captures.fields import state_exposure
 from unmix_plugin.captures.names import natural_order
 from unmix_plugin.captures.numbers import Decoded, Numbers
+from unmix_plugin.captures.report import Code, Remark
 from unmix_plugin.captures.wavelengths import PLAUSIBLE_NM, wavelengths_in_names
 from unmix_plugin.errors import CaptureError, name_some
 from unmix_plugin.limits import allow_decoded, allow_parts
@@ -85,8 +86,8 @@ def open_exr(path: Path, options: ReadOptions) -> Cube:
     allow_parts(path, len(channels), "channels", CaptureError)
     wanted, titles = options.dataset, [str(part.header.get("name", "")) for part in parts]
     considered = [one for one in channels if wanted is None or titles[one.part] == wanted]
-    warnings: list[str] = []
-    table, chosen = _choose(path, considered or channels, None if considered else wanted, warnings)
+    remarks: list[Remark] = []
+    table, chosen = _choose(path, considered or channels, None if considered else wanted, remarks)
     if not all(channel.is_whole for channel in chosen):
         raise CaptureError(f"{path}: channels leave out pixels (sampling above 1, or a deep image)")
     header = parts[chosen[0].part].header
@@ -95,7 +96,7 @@ def open_exr(path: Path, options: ReadOptions) -> Cube:
     unused = set(range(len(parts))) - {channel.part for channel in chosen}
     if unused and table.wavelengths_nm is None:
         names = ", ".join(titles[index] or f"number {index}" for index in sorted(unused))
-        warnings.append(f"only the first part is taken; the file also has the parts {names}")
+        remarks.append(Remark.of(Code.PARTS_LEFT_OUT, names=names))
     windows = {one.part: _window(parts[one.part].header, "dataWindow") for one in chosen}
     is_partial = False
     for index, own in windows.items():
@@ -116,7 +117,7 @@ def open_exr(path: Path, options: ReadOptions) -> Cube:
         for name, value in header.items()
         if isinstance(value, str | int | float) and name not in _OF_ALL_FILES
     }
-    exposure = state_exposure(attributes, "attribute", warnings)
+    exposure = state_exposure(attributes, "attribute", remarks)
     speed, aperture = (attributes.get(key) for key in ("isoSpeed", "aperture"))
     if exposure != Exposure():
         if isinstance(speed, float) and 0 < speed < np.inf:
@@ -128,6 +129,8 @@ def open_exr(path: Path, options: ReadOptions) -> Cube:
         {"name": title, "type": str(part.type()), "channels": counts[index]}
         for index, (title, part) in enumerate(zip(titles, parts, strict=True))
     ]
+    if is_partial:
+        remarks.append(Remark.of(Code.WINDOW_IS_PART))
     keys = tuple((channel.part, channel.name) for channel in chosen)
     dtype = np.result_type(dtype, np.float16) if is_partial else dtype
     height, width = (frame[1] - frame[0])[::-1].tolist()
@@ -139,8 +142,7 @@ def open_exr(path: Path, options: ReadOptions) -> Cube:
         dtype=dtype,
         numbers=Numbers((Decoded(path, dtype, planes, _decode, (keys,)),), planes, "byx", dtype),
         bands=table,
-        notes=("the data window is a part of the picture: pixels outside are missing",) if is_partial else (),
-        warnings=tuple(warnings),
+        remarks=tuple(remarks),
         exposure=exposure,
         reflectance_source="the layer T" if (table.names or ("",))[0].startswith("T.") else "",
         others=attributes
@@ -196,7 +198,7 @@ def _area(window: Int[np.ndarray, "2 2"]) -> int:
 
 
 def _choose(
-    path: Path, channels: list[_Channel], wanted: str | None, warnings: list[str]
+    path: Path, channels: list[_Channel], wanted: str | None, remarks: list[Remark]
 ) -> tuple[BandTable, list[_Channel]]:
     """The channels of a layer that are wavelengths, or all of the first part if none is."""
     names = [channel.name for channel in channels]
@@ -241,11 +243,10 @@ def _choose(
     )
     chosen = [by_name[channel.name] for channel in taken]
     if others := [repr(other) for other in layers if other != layer and wanted is None]:
-        warnings.append(f"layer '{layer}' is taken; the file also has {', '.join(others)} (--dataset)")
+        remarks.append(Remark.of(Code.LAYER_TAKEN, layer=layer, others=", ".join(others)))
     alike = {channel.part for channel in channels if channel.name in (table.names or ())}
     if repeated := alike - {channel.part for channel in chosen}:
-        same = f"{len(repeated)} other parts have the same ones"
-        warnings.append(f"wavelengths of the first part are taken; {same} (--dataset)")
+        remarks.append(Remark.of(Code.PARTS_ALIKE, number=len(repeated)))
     return table, chosen
 
 

@@ -14,7 +14,7 @@ from xml.etree.ElementTree import Element
 
 from unmix_plugin.captures.cube import Cube, Linear, Meaning
 from unmix_plugin.captures.fields import Format, check_bands, plain_names, state_bands, state_linear
-from unmix_plugin.errors import counted
+from unmix_plugin.captures.report import Code, Remark
 from unmix_plugin.limits import parse_xml, read_bounded
 
 GdalItems: TypeAlias = Mapping[str, Mapping[int | None, str]]
@@ -37,12 +37,12 @@ _OF_BANDS = {
 """What XML beside a file says of a band, by names in GDAL's, EnMAP's and DESIS's."""
 
 
-def gdal_items(text: str, warnings: list[str]) -> GdalItems:
-    """Entries of a tag; none, and a warning, where it is damaged."""
+def gdal_items(text: str, remarks: list[Remark]) -> GdalItems:
+    """Entries of a tag; none, and a remark, where it is damaged."""
     try:
         items = list(parse_xml(text).iter("Item")) if text else []
     except ValueError:
-        warnings.append("GDAL's metadata in the file is damaged: gains and wavelengths in it are not used")
+        remarks.append(Remark.of(Code.GDAL_DAMAGED))
         return {}
     found: dict[str, dict[int | None, str]] = defaultdict(dict)
     for item in items:
@@ -65,7 +65,7 @@ def gdal_entries(items: GdalItems) -> dict[str, Any]:
 
 
 def gdal_linear(
-    path: Path, items: GdalItems, num_bands: int, where: str, warnings: list[str]
+    path: Path, items: GdalItems, num_bands: int, where: str, remarks: list[Remark]
 ) -> Linear | None:
     """Gains and offsets, where bands may lack their own. Raises CaptureError: they are no numbers, or impossible."""
     entries = gdal_entries(items)
@@ -74,12 +74,11 @@ def gdal_linear(
             usual = items[key].get(None, "1" if name in Format.GDAL.gains else "0")
             lacking = num_bands - len(items[key].keys() - {None})
             if lacking > 0 and None not in items[key]:
-                warnings.append(
-                    f"{where} '{key}' is stated of {num_bands - lacking} of {num_bands} bands: that of the others is "
-                    f"taken for {usual}, and their values may be off by a factor"
-                )
+                facts = {"stated": num_bands - lacking, "bands": num_bands, "usual": usual}
+                entry = f"{where} '{key}'"
+                remarks.append(Remark(Code.GAINS_OF_SOME_BANDS, {"entry": entry, **facts}))
             entries[key] = [items[key].get(band, usual) for band in range(num_bands)]
-    return state_linear(path, num_bands, entries, where, Format.GDAL, warnings)
+    return state_linear(path, num_bands, entries, where, Format.GDAL, remarks)
 
 
 def gdal_number(text: str) -> float | None:
@@ -108,17 +107,16 @@ def with_xml_beside(file: Cube) -> Cube:
         for ending in ("METADATA.XML", "METADATA.xml")
     ]
     for path in filter(Path.is_file, beside):
-        warnings: list[str] = []
-        file = _with_xml(file, path, warnings)
-        file = replace(file, warnings=(*file.warnings, *warnings))
+        remarks: list[Remark] = []
+        file = _with_xml(file, path, remarks).remarking(*remarks)
     return file
 
 
-def _with_xml(file: Cube, found: Path, warnings: list[str]) -> Cube:
+def _with_xml(file: Cube, found: Path, remarks: list[Remark]) -> Cube:
     try:
         root = parse_xml(read_bounded(found))
     except ValueError:
-        warnings.append(f"{found.name} is damaged: what it says is not used")
+        remarks.append(Remark.of(Code.XML_DAMAGED, xml=found.name))
         return file
     num_bands, first, meaning = file.shape[2], 1, None
     elements = list(root.iter("PAMRasterBand"))
@@ -127,8 +125,8 @@ def _with_xml(file: Cube, found: Path, warnings: list[str]) -> Cube:
         elements = [element for place in places for element in root.iterfind(place)]
         detector = next((end[1] for path in file.files if (end := _IMAGE_NAME.search(path.stem))), None)
         if len(elements) < num_bands or (len(elements) > num_bands and detector is None):
-            listed = f"{found.name} describes {counted(len(elements), 'band')}, the image has {num_bands}"
-            warnings.append(f"{listed}: wavelengths and gains in it are not used")
+            facts = {"described": len(elements), "bands": num_bands}
+            remarks.append(Remark(Code.XML_OF_OTHER_BANDS, {"xml": found.name, **facts}))
             return file
         first = 1 + len(elements) - num_bands if detector == "_SWIR" else 1
         level = _LEVEL.search(root.findtext("base/level") or found.stem)
@@ -138,9 +136,9 @@ def _with_xml(file: Cube, found: Path, warnings: list[str]) -> Cube:
     unit = {} if found.name.endswith(".aux.xml") else {"wavelength_units": "nm"}
     stated = state_bands(gdal_entries(of_all) | unit, found.name)
     if bands.wavelengths_nm is None and (stated.centres or stated.names):
-        table = check_bands(stated, num_bands, warnings).marking(bands.bad)
+        table = check_bands(stated, num_bands, remarks).marking(bands.bad)
         bands = replace(table, names=table.names if bands.names is None else bands.names)
-    linear = file.linear or gdal_linear(file.path, items, num_bands, found.name, warnings)
+    linear = file.linear or gdal_linear(file.path, items, num_bands, found.name, remarks)
     if linear is not None and meaning:
         linear = replace(linear, source=f"{linear.source} of {meaning.value}", meaning=meaning)
     texts = items.get("no_data", {}).values()

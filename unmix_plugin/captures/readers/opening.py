@@ -33,6 +33,7 @@ from unmix_plugin.captures.readers.exr import open_exr
 from unmix_plugin.captures.readers.gdal import with_xml_beside
 from unmix_plugin.captures.readers.pictures import open_picture
 from unmix_plugin.captures.readers.tiff import open_tiff
+from unmix_plugin.captures.report import Code, Kind, Remark, sentences
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.formats.envi import header_beside
 from unmix_plugin.limits import open_regular, open_zip
@@ -105,11 +106,11 @@ def open_spectral_file(path: Path, options: ReadOptions | None = None) -> Cube:
         if opened.dtype.kind not in "iuf":
             raise CaptureError(f"{path}: the image holds {opened.dtype.name}; expected real numbers")
         unused = [
-            f"--{name} does nothing: the format {opened.reader} leaves no choice"
+            Remark.of(Code.OPTION_UNUSED, option=name, reader=opened.reader)
             for name, readers in _USED_BY.items()
             if opened.reader not in readers and getattr(options, name) is not None
         ]
-        opened = replace(opened, notes=(*opened.notes, *unused))
+        opened = opened.remarking(*unused)
         given = options.wavelengths_nm
         if given is None:
             return opened
@@ -149,10 +150,7 @@ def _with_mask_beside(file: Cube) -> Cube:
         mask = _READERS[_file_kind(path)](path, ReadOptions())
         if mask.shape not in {(height + file.dark_lines, width, bands) for bands in (1, num_bands)}:
             size = " x ".join(map(str, mask.shape))
-            warning = (
-                f"the mask {path.name} has {size} rows, columns and bands, not those of the image: not used"
-            )
-            file = replace(file, warnings=(*file.warnings, warning))
+            file = file.remarking(Remark.of(Code.MASK_OF_OTHER_SIZE, mask=path.name, size=size))
             continue
         if mask.numbers is not None:
             file = with_mask(replace(file, sources=(*file.sources, path)), path.name, mask.numbers)
@@ -235,7 +233,7 @@ def inspect_file(path: Path, options: ReadOptions | None = None) -> dict[str, An
             "gains": linear and linear.gains.tolist(),
             "offsets": linear and linear.offsets.tolist(),
             "no_data": _plain(opened.no_data[0] if len(opened.no_data) == 1 else opened.no_data or None),
-            "notes": [*opened.warnings, *opened.notes],
+            "notes": [text for kind in (Kind.WRONG, Kind.DONE) for text in sentences(opened.remarks, kind)],
             "metadata": _plain(opened.facts),
         }
     if opened is None or (path.suffix.lower() == ".npy" and opened.shape[1:] == (_LLFF_COLUMNS, 1)):

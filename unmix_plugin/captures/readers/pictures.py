@@ -11,7 +11,6 @@ import numpy as np
 
 from unmix_plugin.captures.camera_tags import parse_xmp, with_camera_tags
 from unmix_plugin.captures.cube import (
-    COLOURS_AS_STORED,
     BandTable,
     CameraTags,
     Cube,
@@ -20,6 +19,7 @@ from unmix_plugin.captures.cube import (
 )
 from unmix_plugin.captures.fields import state_exposure
 from unmix_plugin.captures.numbers import Decoded, Numbers
+from unmix_plugin.captures.report import Code, Remark
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.limits import allow_decoded
 
@@ -57,9 +57,10 @@ def open_picture(path: Path, _: ReadOptions) -> Cube:
     xmp = parse_xmp(info.get("xmp") or b"")
     colours = BandTable(names=("red", "green", "blue") if num_bands == 3 else None)
     bands = with_camera_tags(colours, xmp, num_bands)
-    warnings = [COLOURS_AS_STORED] if deep == 3 and bands.wavelengths_nm is None else []
+    remarks = [Remark.of(Code.COLOURS_AS_STORED)] if deep == 3 and bands.wavelengths_nm is None else []
+    remarks += [Remark.of(Code.OPACITY_LEFT_OUT)] if alpha else []
     exposed = {name: taken[code] for code, name in _EXPOSURE.items() if code in taken}
-    exposure = state_exposure(exposed, "tag", warnings)
+    exposure = state_exposure(exposed, "tag", remarks)
     size = height, width, num_bands
     return Cube(
         path=path,
@@ -69,8 +70,7 @@ def open_picture(path: Path, _: ReadOptions) -> Cube:
         numbers=Numbers((Decoded(path, dtype, size, _decode, (deep,)),), size, "yxb", dtype),
         bands=bands,
         interleave="bip" if num_bands == 3 else None,
-        notes=("the picture has opacity, which is not a band and is left out",) if alpha else (),
-        warnings=tuple(warnings),
+        remarks=tuple(remarks),
         exposure=exposure,
         camera=CameraTags(xmp),
         is_srgb=num_bands == 3 and dtype.itemsize == 1 and bands.wavelengths_nm is None,

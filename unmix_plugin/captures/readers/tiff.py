@@ -24,7 +24,6 @@ import numpy as np
 
 from unmix_plugin.captures.camera_tags import camera_tags, with_camera_tags
 from unmix_plugin.captures.cube import (
-    COLOURS_AS_STORED,
     Cube,
     ReadOptions,
     import_extra,
@@ -34,7 +33,8 @@ from unmix_plugin.captures.fields import StatedBands, check_bands, state_bands, 
 from unmix_plugin.captures.numbers import Axes, Block, Decoded, Mapped, Numbers
 from unmix_plugin.captures.readers.arrays import choose_axes, image_shape
 from unmix_plugin.captures.readers.gdal import gdal_entries, gdal_items, gdal_linear, gdal_number
-from unmix_plugin.errors import CaptureError, counted
+from unmix_plugin.captures.report import Code, Remark
+from unmix_plugin.errors import CaptureError
 from unmix_plugin.limits import MOST_BANDS, allow_decoded, allow_parts, refuse
 from unmix_plugin.spectral.bands import nm_per_unit
 
@@ -115,8 +115,8 @@ def open_tiff(path: Path, options: ReadOptions) -> Cube:
     file is cut short."""
     _check_directories(path)
     with _logged() as messages, import_extra("tifffile").TiffFile(path) as file:
-        warnings: list[str] = []
-        stack = _find_stack(path, file, warnings)
+        remarks: list[Remark] = []
+        stack = _find_stack(path, file, remarks)
         if any("page offset" in message for message in messages):
             raise CaptureError(f"{path}: cut short: only {len(file.pages)} pages are there; copy it again")
         first = stack.pages[0]
@@ -124,7 +124,7 @@ def open_tiff(path: Path, options: ReadOptions) -> Cube:
         # What holds for the whole file stands in its first page, which may be a preview.
         top: Any = file.pages.first
         texts = dict.fromkeys(_text(page, _GDAL_METADATA) for page in (first, top))
-        items = next(filter(None, (gdal_items(text, warnings) for text in texts)), {})
+        items = next(filter(None, (gdal_items(text, remarks) for text in texts)), {})
         entries = gdal_entries(items)
         said = [state_bands(entries, "GDAL metadata")]
         said += [state_bands(_described(page), "image description") for page in (first, top)]
@@ -132,7 +132,7 @@ def open_tiff(path: Path, options: ReadOptions) -> Cube:
         of_page = len(stack.pages) > 1  # a description of one wavelength may be that of its page alone
         said = [one for one in said if not (of_page and len(one.centres or ()) == 1)]
         stated = next((one for one in said if one.centres or one.names), from_pages)
-        stack = _with_fill(stack, gdal_number(_text(first, _GDAL_NODATA)), warnings)
+        stack = _with_fill(stack, gdal_number(_text(first, _GDAL_NODATA)), remarks)
         on_map = any(tag in first.tags for tag in _GEO_TAGS)
         masks = _mask_pages(path, file, first)
     given = options.wavelengths_nm if options.wavelengths_nm is not None else stated.centres
@@ -141,20 +141,24 @@ def open_tiff(path: Path, options: ReadOptions) -> Cube:
     interleave = None if first.samplesperpixel == 1 else "bsq" if first.planarconfig == 2 else "bip"
     if is_stack:
         num_known = None if given is None else len(given)
-        axes = choose_axes(stack.shape, options.axes, num_known, warnings, "byx")
+        axes = choose_axes(stack.shape, options.axes, num_known, remarks, "byx")
         interleave = {"b": "bsq", "y": "bip" if axes[2] == "b" else "bil"}.get(axes[0])
     shape = image_shape(stack.shape, axes)
     allow_parts(path, shape[2], "bands", CaptureError, MOST_BANDS)
-    bands = check_bands(stated, shape[2], warnings)
-    linear = gdal_linear(path, items, shape[2], "GDAL's", warnings)
+    bands = check_bands(stated, shape[2], remarks)
+    linear = gdal_linear(path, items, shape[2], "GDAL's", remarks)
     applied = () if linear is None else linear.entries
     exposed = {f"EXIF {name}": value for name, value in tags.exif.items()}
     exposed |= {name: value for name, value in entries.items() if name not in applied}
-    exposure = state_exposure(exposed, "tag or metadata", warnings)
+    exposure = state_exposure(exposed, "tag or metadata", remarks)
     turned: Any = tags.exif.get("Orientation")
     # A picture is as bright as its numbers to the eye only.
     is_colour = first.photometric in _COLOURS and bands.wavelengths_nm is None
-    warnings += [COLOURS_AS_STORED] if is_colour and first.dtype in (np.uint8, np.uint16) else []
+    remarks += (
+        [Remark.of(Code.COLOURS_AS_STORED)] if is_colour and first.dtype in (np.uint8, np.uint16) else []
+    )
+    others = [text for text in messages if "GDAL_NODATA" not in text][:3]
+    remarks += [Remark.of(Code.NOTE, text=text) for text in others]
     opened = Cube(
         path=path,
         reader="tiff",
@@ -165,8 +169,7 @@ def open_tiff(path: Path, options: ReadOptions) -> Cube:
         interleave=interleave,
         linear=linear,
         no_data=stack.no_data,
-        notes=tuple(text for text in messages if "GDAL_NODATA" not in text)[:3],
-        warnings=tuple(warnings),
+        remarks=tuple(remarks),
         exposure=exposure,
         camera=tags,
         orientation=int(turned) if turned in range(1, 9) else 1,
@@ -223,7 +226,7 @@ def _logged() -> Iterator[list[str]]:
         logger.propagate = propagated
 
 
-def _find_stack(path: Path, file: TiffFile, warnings: list[str]) -> _Stack:
+def _find_stack(path: Path, file: TiffFile, remarks: list[Remark]) -> _Stack:
     """The pages that hold the most bands, all alike; previews and masks are passed over."""
     pages = _image_pages(file)
     if not pages:
@@ -246,7 +249,7 @@ def _find_stack(path: Path, file: TiffFile, warnings: list[str]) -> _Stack:
     allow_decoded(path, max(of_strip, sum(page.nbytes for page in compressed)), CaptureError)
     others = [group for group in groups.values() if group is not like]
     shown = ", ".join(f"{len(group)} of {' x '.join(map(str, group[0].shape))}" for group in others)
-    warnings += [f"pages of other sizes or types are left out: {shown}"] if others else []
+    remarks += [Remark.of(Code.PAGES_LEFT_OUT, pages=shown)] if others else []
     planes, _, height, width, samples = first.shaped
     dtype = np.dtype(first.dtype).newbyteorder(file.byteorder)
     # ImageJ describes one page of one band, behind which the others lie.
@@ -259,7 +262,7 @@ def _find_stack(path: Path, file: TiffFile, warnings: list[str]) -> _Stack:
             raise CaptureError(f"{path}: cut short: {num_pages} pages reach to byte {end} of {size}")
         return _Stack(like[:1], (num_pages, height, width), dtype, start)
     if any(extra in _OPACITY for extra in first.extrasamples):
-        warnings.append("a number of each pixel is marked as opacity; it is kept as a band")
+        remarks.append(Remark.of(Code.OPACITY_IS_A_BAND))
     if len(like) == 1:
         return _Stack(like, (height, width, planes * samples), dtype)
     if planes * samples > 1:
@@ -270,7 +273,7 @@ def _find_stack(path: Path, file: TiffFile, warnings: list[str]) -> _Stack:
     return _Stack(like, (len(like), height, width), dtype)
 
 
-def _with_fill(stack: _Stack, no_data: float | None, warnings: list[str]) -> _Stack:
+def _with_fill(stack: _Stack, no_data: float | None, remarks: list[Remark]) -> _Stack:
     """The stack with the no-data value of the file, and with what its absent strips and tiles read as.
 
     Source: GDAL, GTiff driver, "Sparse files": they hold the no-data value, or 0 where there is none. Without one,
@@ -287,10 +290,7 @@ def _with_fill(stack: _Stack, no_data: float | None, warnings: list[str]) -> _St
     if no_data is not None and is_usable:
         return replace(stack, fill=no_data, no_data=stated)
     taken = "they count as not measured" if is_float else "pixels of 0 in all bands count as not measured"
-    warnings.append(
-        f"{counted(absent, 'block')} of the image left out in the file, which has no no-data value: {taken}; if these "
-        "are dark and not missing, write the file without gaps (GDAL's SPARSE_OK=FALSE)"
-    )
+    remarks.append(Remark.of(Code.BLOCKS_ABSENT, blocks=absent, taken=taken))
     fill, more = (math.nan, ()) if is_float else (0.0, (0.0,))
     return replace(stack, fill=fill, no_data=(*stated, *more))
 
