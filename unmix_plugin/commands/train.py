@@ -8,16 +8,16 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, fields, is_dataclass, make_dataclass
+from dataclasses import dataclass, make_dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from unmix_plugin.commands.entry import INTERRUPTED, run_command
 from unmix_plugin.commands.training import finish, first_config, prepare, with_limits_given
-from unmix_plugin.engine.configs import CommonFlag, TrainerConfig, UnlistedFlag
+from unmix_plugin.engine.configs import CommonFlag, Setting, TrainerConfig, UnlistedFlag, map_settings
 from unmix_plugin.engine.printing import tell
 from unmix_plugin.engine.registry import MethodSpecification, discover_methods, find_method
 from unmix_plugin.errors import ConfigError
@@ -85,7 +85,13 @@ def _parse(
 ) -> tuple[TrainerConfig, TrainingViewerOptions]:
     name, viewing = method.config.method_name, TrainingViewerOptions(enabled=sys.stdout.isatty())
     if is_shown is not None:
-        default, viewing = _shown_only(default, is_shown), _shown_only(viewing, is_shown)
+
+        def with_help(setting: Setting) -> Setting:
+            if is_shown(setting.marks):
+                return setting
+            return replace(setting, hint=Annotated[setting.hint, tyro.conf.Suppress])
+
+        default, viewing = map_settings(default, with_help), map_settings(viewing, with_help)
     settings, viewer = type(default), type(viewing)
     parts = [("config", Annotated[settings, tyro.conf.arg(name="")]), ("viewer", viewer)]
     kind = make_dataclass("Arguments", parts, frozen=True)
@@ -97,23 +103,6 @@ def _parse(
         description=f"Train {name}: {method.description}.{ending}",
     )
     return found.config, found.viewer
-
-
-def _shown_only(config: Any, is_shown: Callable[[Collection[Any]], bool]) -> Any:
-    """The same settings in classes whose help has those fields alone that are to be shown, by their annotations."""
-    hints = get_type_hints(type(config), include_extras=True)
-    shown: list[tuple[str, Any, Any]] = []
-    values: dict[str, Any] = {}
-    for entry in fields(config):
-        hint, value = hints[entry.name], getattr(config, entry.name)
-        if is_dataclass(value) and not isinstance(value, type):
-            value = _shown_only(value, is_shown)
-            hint = type(value)
-        elif not is_shown(getattr(hint, "__metadata__", ())):
-            hint = Annotated[hint, tyro.conf.Suppress]
-        values[entry.name] = value
-        shown.append((entry.name, hint, field(default_factory=lambda value=value: value)))
-    return make_dataclass(type(config).__name__, shown, bases=(type(config),), frozen=True)(**values)
 
 
 def train(argv: list[str]) -> None:

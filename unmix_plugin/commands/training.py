@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from unmix_plugin.engine.configs import TrainerConfig, settings_of
+from unmix_plugin.engine.configs import Setting, TrainerConfig, map_settings, settings_of
 from unmix_plugin.engine.printing import tell
 from unmix_plugin.engine.registry import MethodSpecification, find_method
 from unmix_plugin.errors import ConfigError, counted, did_you_mean
@@ -98,7 +98,7 @@ def with_limits_given(config: TrainerConfig, *, steps: bool, seconds: bool) -> T
 
 def _with_settings(config: TrainerConfig, settings: Mapping[str, Any]) -> TrainerConfig:
     """The settings changed by name, as the command line names them; hyphens and underscores are alike."""
-    from unmix_plugin.engine.runs.config_json import config_from_json, config_to_json
+    from unmix_plugin.engine.runs.config_json import config_to_json, value_from_json
 
     known: dict[str, tuple[str, ...]] = {}
     for setting in settings_of(config):
@@ -106,9 +106,9 @@ def _with_settings(config: TrainerConfig, settings: Mapping[str, Any]) -> Traine
             aliases = [alias for mark in setting.marks for alias in getattr(mark, "aliases", None) or ()]
             short = (alias.lstrip("-").replace("-", "_") for alias in aliases)
             known |= dict.fromkeys([".".join(setting.path), *short], setting.path)
-    tree, given = {}, {}
+    names: dict[tuple[str, ...], str] = {}
     method = config.method_name
-    for name, value in settings.items():
+    for name in settings:
         plain = name.replace("-", "_")
         path = known.get(plain)
         if path is None:
@@ -116,19 +116,25 @@ def _with_settings(config: TrainerConfig, settings: Mapping[str, Any]) -> Traine
             near = f"did you mean {min(same, key=len)}?" if same else did_you_mean(plain, known)
             listed = f"unmix-train {method} --help-all lists all"
             raise ConfigError(f"{method} has no setting {name}; {near or listed}")
-        if path in given:
-            raise ConfigError(f"{name} and {given[path]} are the same setting: give one of them")
-        given[path] = name
-        branch = tree
-        for key in path[:-1]:
-            branch = branch.setdefault(key, {})
+        if path in names:
+            raise ConfigError(f"{name} and {names[path]} are the same setting: give one of them")
+        names[path] = name
+
+    def given(setting: Setting) -> Setting:
+        if setting.path not in names:
+            return setting
+        name = names[setting.path]
+        value = settings[name]
         try:
-            branch[path[-1]] = config_to_json(value.item() if hasattr(value, "item") else value)
+            plain = config_to_json(value.item() if hasattr(value, "item") else value)
         except TypeError as error:
             raise ConfigError(f"{name}: {error}") from error
-    changed = config_from_json(tree, config, "settings")
+        read = value_from_json(plain, setting.hint, setting.value, ".".join(setting.path))
+        return replace(setting, value=read)
+
+    changed = map_settings(config, given)
     return with_limits_given(
-        changed, steps=("max_num_iterations",) in given, seconds=("max_seconds",) in given
+        changed, steps=("max_num_iterations",) in names, seconds=("max_seconds",) in names
     )
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass, make_dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
@@ -255,8 +255,13 @@ class Setting:
     path: tuple[str, ...]
     """Names of the fields that lead to it."""
     value: Any
-    marks: tuple[Any, ...]
-    """Annotations of its field, such as `AtStartOnly` and `short_flag`."""
+    hint: Any
+    """Type of its field, with annotations such as `AtStartOnly` and `short_flag`."""
+
+    @property
+    def marks(self) -> tuple[Any, ...]:
+        """The annotations."""
+        return getattr(self.hint, "__metadata__", ())
 
     @property
     def flag(self) -> str:
@@ -272,7 +277,38 @@ def settings_of(config: Any, path: tuple[str, ...] = ()) -> Iterator[Setting]:
         if is_dataclass(value) and not isinstance(value, type):
             yield from settings_of(value, here)
         elif not entry.name.startswith("_"):
-            yield Setting(here, value, getattr(hints[entry.name], "__metadata__", ()))
+            yield Setting(here, value, hints[entry.name])
+
+
+def map_settings(config: Any, change: Callable[[Setting], Setting], path: tuple[str, ...] = ()) -> Any:
+    """The same tree of configs with each setting as `change` makes it.
+
+    A config whose annotations change becomes one of a subclass that has these, for the help of a command.
+    """
+    values: dict[str, Any] = {}
+    hints = get_type_hints(type(config), include_extras=True)
+    changed_hints: dict[str, Any] = {}
+    for entry in fields(config):
+        value, here, hint = getattr(config, entry.name), (*path, entry.name), hints[entry.name]
+        if is_dataclass(value) and not isinstance(value, type):
+            values[entry.name] = map_settings(value, change, here)
+            changed_hint = hint if type(values[entry.name]) is type(value) else type(values[entry.name])
+        elif entry.name.startswith("_"):
+            continue
+        else:
+            setting = change(Setting(here, value, hint))
+            values[entry.name], changed_hint = setting.value, setting.hint
+        if changed_hint is not hint:
+            changed_hints[entry.name] = changed_hint
+    changed = replace(config, **values)
+    if not changed_hints:
+        return changed
+    own = [
+        (name, hint, field(default_factory=lambda value=values[name]: value))
+        for name, hint in changed_hints.items()
+    ]
+    kind = make_dataclass(type(config).__name__, own, bases=(type(config),), frozen=True)
+    return kind(**{entry.name: getattr(changed, entry.name) for entry in fields(changed)})
 
 
 def refuse_changes_at_start(before: Any, now: Any) -> None:

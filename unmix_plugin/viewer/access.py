@@ -23,7 +23,7 @@ _LONGEST_TOKEN = 4096
 
 @dataclass(frozen=True)
 class ViewerOptions:
-    """How the viewer is served; impossible settings are a `ConfigError`."""
+    """How the viewer is served."""
 
     host: str = "127.0.0.1"
     """Address to listen at. Any but this machine's loopback lets others reach the viewer: give a token then."""
@@ -37,6 +37,7 @@ class ViewerOptions:
     apart."""
 
     def __post_init__(self) -> None:
+        """Refuse impossible settings by `ConfigError`."""
         if not 0 <= self.port <= 65535:
             raise ConfigError(f"--viewer.port is a number from 0 (any free one) to 65535; found {self.port}")
         if not self.host.strip():
@@ -69,7 +70,7 @@ class ViewerOptions:
 
 @dataclass(frozen=True)
 class TrainingViewerOptions(ViewerOptions):
-    """How a training is shown in the browser; impossible settings are a `ConfigError`."""
+    """How a training is shown in the browser."""
 
     enabled: bool = False
     """Serve the viewer while training; on by default where the output is a terminal."""
@@ -80,6 +81,7 @@ class TrainingViewerOptions(ViewerOptions):
     quarter of that."""
 
     def __post_init__(self) -> None:
+        """Refuse impossible settings by `ConfigError`."""
         super().__post_init__()
         low, high = SHARE_BOUNDS
         if not low <= self.share <= high:

@@ -9,7 +9,7 @@ import math
 import types
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from unmix_plugin.errors import ConfigError
 
@@ -79,7 +79,7 @@ def config_from_json(values: Any, default: ConfigT, where: str = "config") -> Co
         raise ConfigError(f"{where}: {type(default).__name__} has no field {', '.join(unknown)}")
     hints = get_type_hints(type(default))
     changes = {
-        name: _read(value, hints[name], getattr(default, name), f"{where}.{name}")
+        name: value_from_json(value, hints[name], getattr(default, name), f"{where}.{name}")
         for name, value in values.items()
     }
     try:
@@ -102,8 +102,10 @@ def _fields(config: Any) -> list[dataclasses.Field[Any]]:
     return [field for field in dataclasses.fields(config) if not field.name.startswith("_")]
 
 
-def _read(value: Any, hint: Any, default: Any, where: str) -> Any:
-    """`value` as the type `hint` says; ConfigError names `where`."""
+def value_from_json(value: Any, hint: Any, default: Any, where: str) -> Any:
+    """One value as the type `hint` says, `default` what it was before; ConfigError names `where`."""
+    if get_origin(hint) is Annotated:
+        hint = get_args(hint)[0]
     origin = get_origin(hint)
     if origin in (Union, types.UnionType):
         return _read_union(value, get_args(hint), default, where)
@@ -118,7 +120,8 @@ def _read(value: Any, hint: Any, default: Any, where: str) -> Any:
             raise _WrongTypeError(where, "an object", value)
         of_entries, defaults = get_args(hint)[1], default if isinstance(default, Mapping) else {}
         return {
-            key: _read(entry, of_entries, defaults.get(key), f"{where}.{key}") for key, entry in value.items()
+            key: value_from_json(entry, of_entries, defaults.get(key), f"{where}.{key}")
+            for key, entry in value.items()
         }
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
         return config_from_json(value, default if isinstance(default, hint) else hint(), where)
@@ -132,7 +135,7 @@ def _read_union(value: Any, choices: tuple[Any, ...], default: Any, where: str) 
     problems: list[ConfigError] = []
     for choice in fits_default + [choice for choice in choices if choice not in fits_default]:
         try:
-            return _read(value, choice, default, where)
+            return value_from_json(value, choice, default, where)
         except ConfigError as error:  # noqa: PERF203
             problems.append(error)
     mismatches = [
@@ -152,7 +155,7 @@ def _read_sequence(value: Any, kind: type, hints: tuple[Any, ...], default: Any,
         raise ConfigError(f"{where}: expected {len(hints)} entries, found {len(value)}")
     defaults = default if isinstance(default, kind) and len(default) == len(value) else [None] * len(value)
     return kind(
-        _read(entry, hints[0] if repeated else hints[i], defaults[i], f"{where}[{i}]")
+        value_from_json(entry, hints[0] if repeated else hints[i], defaults[i], f"{where}[{i}]")
         for i, entry in enumerate(value)
     )
 
