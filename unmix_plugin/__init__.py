@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from unmix_plugin.commands.training import train as train
+    from unmix_plugin.comparing.comparison import Comparison as Comparison
+    from unmix_plugin.comparing.comparison import compare_runs as compare_runs
     from unmix_plugin.editing.apply import edit_scene as edit_scene
     from unmix_plugin.editing.recipe import Light as Light
     from unmix_plugin.editing.recipe import Recipe as Recipe
@@ -44,11 +46,13 @@ __version__ = "0.1.0"
 
 _MODULES = {
     "Cameras": "engine.geometry.cameras",
+    "Comparison": "comparing.comparison",
     "Light": "editing.recipe",
     "MaterialView": "trained.outputs",
     "Probe": "trained.protocol",
     "Recipe": "editing.recipe",
     "TrainedScene": "trained.trained_scene",
+    "compare_runs": "comparing.comparison",
     "edit_scene": "editing.apply",
     "open_run": "trained.open_run",
     "read_recipe": "editing.recipe_files",

@@ -1,0 +1,126 @@
+"""One HTML file about what has changed: before and after under a slider, what differs, and a list of places to click.
+
+It holds all that it shows, and asks for nothing.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from unmix_plugin.comparing.comparison import Comparison
+from unmix_plugin.comparing.printed import amount_said
+from unmix_plugin.comparing.shown import ChangeMap, ShownView, strip
+from unmix_plugin.figures.pictures import Picture
+from unmix_plugin.formats.files import eight_bits, rgba_png_bytes
+from unmix_plugin.trained.measures import describe_area, describe_scale
+
+_LARGEST_SIDE_PX = 800
+"""Larger pictures are shrunk."""
+
+
+def changes_page(comparison: Comparison, views: Sequence[ShownView], maps: Sequence[ChangeMap]) -> bytes:
+    """The bytes of the page."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader("unmix_plugin.comparing", "."),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=StrictUndefined,
+    )
+    values = {
+        "title": f"What has changed: {comparison.before.name}, {comparison.after.name}",
+        "facts": _facts(comparison),
+        "notes": comparison.notes,
+        "places": _rows(comparison),
+        "view_names": [view.name for view in views],
+        "scales": [
+            {"title": one.title, "label": one.scale.label, "low": f"{one.scale.low:.3g}",
+             "high": f"{one.scale.high:.3g}", "strip": _png_url(strip(one.scale))}
+            for one in maps
+        ],
+        "data": {"views": [_view_data(comparison, view, maps) for view in views]},
+    }  # fmt: skip
+    values["data"] = _script_json(values["data"])
+    return environment.get_template("changes.html").render(values).encode("utf-8", "backslashreplace")
+
+
+def _script_json(values: Any) -> str:
+    """JSON that may stand in a script element, whatever the names in it."""
+    text = json.dumps(values)
+    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+
+
+def _facts(comparison: Comparison) -> list[tuple[str, str]]:
+    found, light = comparison.registration, comparison.registration.light
+    return [
+        ("Changed", f"{comparison.changed_area:.2%} of what both see, {len(comparison.places)} places"),
+        ("Registration", f"{found.rms_px:.2f} pixels rms, {found.overlap:.0%} overlap"),
+        ("Light, after over before", f"{np.median(light):.3g} ({light.min():.3g} to {light.max():.3g})"),
+        ("Materials", comparison.materials.said()),
+        ("Bands", str(comparison.bands)),
+        ("Lengths", describe_scale(comparison.before.scale)),
+        ("False discoveries", f"at most {comparison.level:.0%} of the changed vertices"),
+    ]
+
+
+def _rows(comparison: Comparison) -> list[dict[str, str | int]]:
+    return [
+        {
+            "number": place.number,
+            "what": place.what,
+            "area": describe_area(place.area, comparison.before.scale),
+            "center": ", ".join(f"{value:.3g}" for value in place.center),
+            "amount": amount_said(comparison, place.number),
+            "angle": _number(place.angle, 3),
+            "brightness": _number(place.amounts["brightness"].mean, 2),
+            "p": f"{place.p:.2g}",
+        }
+        for place in comparison.places
+    ]
+
+
+def _number(value: float, digits: int) -> str:
+    return f"{value:.{digits}f}" if np.isfinite(value) else "not seen"
+
+
+def _view_data(comparison: Comparison, view: ShownView, maps: Sequence[ChangeMap]) -> dict[str, Any]:
+    """Pictures of a view as URLs, and where it shows which place: runs of equal numbers, row after row."""
+    numbers = view.places(comparison)
+    flat = numbers.ravel()
+    ends = np.append(np.flatnonzero(np.diff(flat)) + 1, flat.size)
+    lengths = np.diff(np.append(0, ends))
+    middles = {}
+    for number in np.unique(flat[flat > 0]):
+        rows, columns = np.nonzero(numbers == number)
+        reach = max(float(np.ptp(rows)), float(np.ptp(columns))) / 2 + 3
+        middles[int(number)] = [float(columns.mean()) + 0.5, float(rows.mean()) + 0.5, reach, len(rows)]
+    height, width = numbers.shape
+    return {
+        "name": view.name,
+        "width": width,
+        "height": height,
+        "before": _png_url(view.before),
+        "after": _png_url(view.after),
+        "maps": [_png_url(one.painted(view, comparison.level)) for one in maps],
+        "runs": [[int(flat[end - 1]), int(length)] for end, length in zip(ends, lengths, strict=True)],
+        "middles": middles,
+    }
+
+
+def _png_url(image: Picture) -> str:
+    """An sRGB picture as a URL that holds it."""
+    from PIL import Image
+
+    pixels = Image.fromarray(eight_bits(np.asarray(image)))
+    longest = max(pixels.size)
+    if longest > _LARGEST_SIDE_PX:
+        width, height = (max(1, round(side * _LARGEST_SIDE_PX / longest)) for side in pixels.size)
+        pixels = pixels.resize((width, height), Image.Resampling.LANCZOS)
+    return f"data:image/png;base64,{base64.b64encode(rgba_png_bytes(np.asarray(pixels))).decode()}"

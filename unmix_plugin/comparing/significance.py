@@ -1,0 +1,207 @@
+"""How sure a difference between two captures is, from how much the views of each differ among themselves.
+
+At every place each view that sees it gives a value. The difference of the two captures' means is divided by its
+standard error, whose variances lean on those of all places (moderated t). What such numbers are where nothing changed
+is seen in halves of one capture's own views, drawn at random: their differences are noise alone. As halves have fewer
+views, their t are taken to what t of as many views as both captures have would be. What halves of one capture can't
+show (a registration that is a little off, two trainings that err differently) is in the width: the middle of what is
+found between the captures, most of which did not change, is laid on the middle of the halves'.
+
+Where a surface lies is no measurement of single views: all show the one field that a run has learnt, and agree in its
+errors. So the error of distances is found from the differences themselves: how large they are at places like this one
+(by how far views differ, how bent and rough the surface is, how many views see it), and the tail of a t distribution
+that fits their middle.
+
+Source: moderated variances, Smyth 2004; an empirical null whose width is that of the middle, Efron 2004; false
+discoveries among many places, Benjamini and Hochberg 1995.
+
+Notation: `V` views, `P` places, `Q` quantities, `F` features of places.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Float64, Int
+from scipy import stats
+
+_PRIOR_DEGREES = 4.0
+"""Degrees of freedom that the variance of all places counts for at each of them."""
+_SPLITS = 8
+"""Of each capture's views into halves."""
+LEAST_SEEN = 4
+"""Views of each capture that have to see a place, so that something can be said of it."""
+_MIDDLE = 0.7
+"""Quantile at which the two distributions are laid on each other, the nearer to the tail the better they agree there; a
+change of more places than are beyond makes everything less significant."""
+_NO_VARIANCE, _NOTHING = 1e-14, 1e-9
+"""Variances and squared ratios below which nothing is there, as of the abundance of a material that is elsewhere."""
+
+
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """What the views of one capture say of each place together."""
+
+    mean: Float64[np.ndarray, "P Q"]
+    variance: Float64[np.ndarray, "P Q"]
+    """Between views."""
+    count: Int[np.ndarray, " P"]
+
+    @classmethod
+    def of(cls, values: Float[np.ndarray, "V P Q"]) -> Moments:
+        """Of values that are NaN where a view does not see a place."""
+        seen = np.asarray(np.isfinite(values).all(axis=2))
+        count = seen.sum(axis=0)
+        known = np.where(seen[..., None], values, 0.0).astype(np.float64)
+        divisor = count.clip(min=1)[:, None]
+        mean = known.sum(axis=0) / divisor
+        squares = (np.where(seen[..., None], known - mean, 0.0) ** 2).sum(axis=0)
+        return cls(mean, squares / (count - 1).clip(min=1)[:, None], count)
+
+    @property
+    def error_squared(self) -> Float64[np.ndarray, "P Q"]:
+        """Of the mean: the variance, drawn towards that of all places, over the number of views."""
+        differing = np.where(
+            (self.count >= 3)[:, None] & (self.variance > _NO_VARIANCE), self.variance, np.nan
+        )
+        several = np.isfinite(differing).any(axis=0)
+        common = np.zeros(self.mean.shape[1])
+        common[several] = np.nanmedian(differing[:, several], axis=0)
+        degrees = (self.count - 1).clip(min=0)[:, None]
+        variance = (_PRIOR_DEGREES * common + degrees * self.variance) / (_PRIOR_DEGREES + degrees)
+        return variance.clip(min=1e-24) / self.count.clip(min=1)[:, None]
+
+
+def _ratios(first: Moments, second: Moments, least: int) -> Float64[np.ndarray, "P Q"]:
+    """Differences over their standard errors; NaN where one of the two is seen by too few views."""
+    both = (first.count >= least) & (second.count >= least)
+    found = (second.mean - first.mean) / np.sqrt(first.error_squared + second.error_squared)
+    return np.where(both[:, None], found, np.nan)
+
+
+def _degrees(count: Int[np.ndarray, " P"]) -> Float64[np.ndarray, " P"]:
+    """Of freedom of the t of two groups with so many views in all."""
+    return _PRIOR_DEGREES + (count - 2).clip(min=1).astype(np.float64)
+
+
+def _null(values: Float[np.ndarray, "V P Q"], generator: np.random.Generator) -> Float64[np.ndarray, "n Q"]:
+    """The same of halves of one capture's views."""
+    found = []
+    for _ in range(_SPLITS):
+        order = generator.permutation(len(values))
+        halves = [Moments.of(values[half]) for half in np.array_split(order, 2)]
+        ratios = _ratios(halves[0], halves[1], LEAST_SEEN // 2)
+        known = np.isfinite(ratios).all(axis=1)
+        count = (halves[0].count + halves[1].count)[known]
+        # t of these degrees of freedom as t of twice as many views have it, at the same probability.
+        tail = stats.t.sf(np.abs(ratios[known]), _degrees(count)[:, None])
+        found.append(stats.t.isf(tail.clip(min=1e-300), _degrees(2 * count)[:, None]))
+    return np.concatenate(found)
+
+
+@dataclass(frozen=True, eq=False)
+class Difference:
+    """How one quantity, of one number or several, differs between the captures at each place."""
+
+    mean: Float64[np.ndarray, "P Q"]
+    """Second less first."""
+    error: Float64[np.ndarray, "P Q"]
+    """Standard error of that, widened as the calibration says."""
+    p: Float64[np.ndarray, " P"]
+    """Probability of so large a difference where nothing changed; NaN where too few views see the place."""
+    widening: float
+    """How much wider differences between the captures are than halves of one would let expect."""
+
+    @property
+    def q(self) -> Float64[np.ndarray, " P"]:
+        """`p` after correction for all places."""
+        return adjusted(self.p)
+
+
+def difference(
+    before: Float[np.ndarray, "V P Q"], after: Float[np.ndarray, "W P Q"], seed: int = 0
+) -> Difference:
+    """Compare what two captures' views say of the same places; several numbers are tested together."""
+    first, second = Moments.of(before), Moments.of(after)
+    ratios = _ratios(first, second, LEAST_SEEN)
+    generator = np.random.default_rng(seed)
+    null = np.concatenate([_null(before, generator), _null(after, generator)])
+    found, expected = (ratios**2).sum(axis=1), np.sort((null**2).sum(axis=1))
+    known = np.isfinite(found)
+    if not known.any() or len(expected) == 0:
+        nothing = np.full_like(ratios, np.nan)
+        return Difference(nothing, nothing, np.full(len(ratios), np.nan), 1.0)
+    middles = [
+        float(np.quantile(sizes, _MIDDLE)) if len(sizes) else 1.0
+        for sizes in (found[known & (found > _NOTHING)], expected[expected > _NOTHING])
+    ]
+    widening = (middles[0] / middles[1]) ** 0.5
+    error = widening * np.sqrt(first.error_squared + second.error_squared)
+    mean = np.where(known[:, None], second.mean - first.mean, np.nan)
+    return Difference(
+        mean,
+        np.where(known[:, None], error, np.nan),
+        _tail(found / widening**2, expected),
+        widening,
+    )
+
+
+_DEGREES = (2.0, 2.5, 3.0, 4.0, 5.0, 7.0, 10.0, 15.0, 30.0, 100.0)
+"""Of freedom that are tried."""
+_INNER, _OUTER = 0.5, 0.95
+"""Quantiles of sizes that t is fitted to; what changed is expected beyond."""
+_LEAST_DISTANCE = 0.005
+"""Pixels below which a distance is as good as none."""
+
+
+def difference_of_heights(
+    change: Float64[np.ndarray, " P"], features: Float64[np.ndarray, "P F"]
+) -> Difference:
+    """What of differences of heights (pixels, NaN where unknown) is significant, where nothing but they and features of
+    the places tell how uncertain they are."""
+    known = np.isfinite(change) & np.isfinite(features).all(axis=1)
+    p, error = np.full(len(change), np.nan), np.full(len(change), np.nan)
+    if known.sum() < 20 * (1 + features.shape[1]):
+        return Difference(np.where(known, change, np.nan)[:, None], error[:, None], p, 1.0)
+    given = features[known]
+    columns = np.concatenate([np.ones((len(given), 1)), given, given**2], axis=1)
+    sizes = np.log(np.abs(change[known]) + _LEAST_DISTANCE)
+    solution, *_ = np.linalg.lstsq(columns, sizes, rcond=None)
+    usual = np.exp(columns @ solution)
+    ratios = np.abs(change[known]) / usual
+    inner, outer = np.quantile(ratios, _INNER), np.quantile(ratios, _OUTER)
+    spreads = [stats.t.ppf((1 + _OUTER) / 2, n) / stats.t.ppf((1 + _INNER) / 2, n) for n in _DEGREES]
+    degrees = _DEGREES[int(np.argmin(np.abs(np.array(spreads) - outer / max(inner, 1e-12))))]
+    scale = max(float(inner / stats.t.ppf((1 + _INNER) / 2, degrees)), 1e-12)
+    p[known] = 2 * stats.t.sf(ratios / scale, degrees)
+    error[known] = usual * scale
+    return Difference(np.where(known, change, np.nan)[:, None], error[:, None], p, 1.0)
+
+
+def _tail(found: Float64[np.ndarray, " P"], expected: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " P"]:
+    """Part of the expected, sorted numbers that are as large; a floor of one in all of them."""
+    larger = len(expected) - np.searchsorted(expected, found, side="left")
+    return np.where(np.isfinite(found), (1 + larger) / (1 + len(expected)), np.nan)
+
+
+def adjusted(p: Float[np.ndarray, " P"]) -> Float64[np.ndarray, " P"]:
+    """p after Benjamini and Hochberg: among places below a limit, at most that part is false; NaN stays.
+
+    >>> adjusted(np.array([0.01, 0.02, 0.9, np.nan])).round(2)
+    array([0.03, 0.03, 0.9 ,  nan])
+    """
+    known = np.isfinite(p)
+    values = p[known]
+    order = np.argsort(values)
+    ranked = values[order] * len(values) / np.arange(1, len(values) + 1)
+    found = np.empty_like(values, dtype=np.float64)
+    found[order] = np.minimum.accumulate(ranked[::-1])[::-1].clip(max=1.0)
+    result = np.full(len(p), np.nan)
+    result[known] = found
+    return result
+
+
+def is_significant(q: Float[np.ndarray, " P"], level: float) -> Bool[np.ndarray, " P"]:
+    """Where a corrected p is known and small."""
+    return np.isfinite(q) & (np.where(np.isfinite(q), q, 1.0) <= level)
