@@ -6,7 +6,7 @@ its area, so several rays are cast through it, one in each cell of a grid on it;
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -25,14 +25,20 @@ from unmix_plugin.engine.model import DataManager, TrainingCallback, TrainingCal
 from unmix_plugin.light.search import find_lamp
 from unmix_plugin.poses.knots import Knots
 from unmix_plugin.presets import choose, preset_for
-from unmix_plugin.scenes.doctor import check_masks
+from unmix_plugin.scenes.doctor import (
+    Finding,
+    check_bands,
+    check_lenses,
+    check_masks,
+    check_parallax,
+    check_poses,
+    check_rig,
+)
 from unmix_plugin.scenes.evidence import (
     AlphaEvidence,
     band_weights,
     judge_sensors,
-    noise_warnings,
     relative_power,
-    rig_warnings,
 )
 from unmix_plugin.scenes.geometry.carving import Cells, Masks, carve, share_contradicted, share_explained
 from unmix_plugin.scenes.geometry.lighting import judge_exposure, judge_light
@@ -41,11 +47,9 @@ from unmix_plugin.scenes.geometry.surface_evidence import SurfaceEvidence
 from unmix_plugin.scenes.geometry.view_agreement import (
     compare_scene_conventions,
     convention_decision,
-    describe,
-    lens_warning,
-    parallax_warning,
     training_views,
 )
+from unmix_plugin.scenes.messages import Message
 from unmix_plugin.scenes.pixel_table import PixelRays, PixelTable
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.scenes.scene import check_recorded_scene, scene_identity
@@ -243,17 +247,30 @@ class HyperspectralDataManager(DataManager):
     def warnings(self) -> list[str]:
         """Poses that seem to follow another convention, cameras far off or at one place, masks that contradict
         each other, a backdrop, sensors that share no band or no place with another, and bad bands and values."""
-        found = [describe(self._conventions) or self._carved[1], *self._pixels.notes, *self.scene.warnings]
-        found.append(parallax_warning(self._initial_data["knots"], self.scene_box))
-        found.append(lens_warning(self.train_cameras))
-        found += noise_warnings(self.scene, self._noise, self._pixels.bad_share)
+        advice = "Poses may be off by some pixels (--poses refine corrects them), or masks have holes"
+        return [
+            *(
+                finding.sentence(advice)
+                for finding in [check_poses(self._conventions) or self._carved[1]]
+                if finding
+            ),
+            *self._pixels.notes,
+            *self.scene.warnings,
+            *(finding.sentence() for finding in self._findings()),
+        ]
+
+    def _findings(self) -> Iterator[Finding]:
+        """What looks wrong with the scene beside its poses and masks."""
+        checks = (
+            check_parallax(self._initial_data["knots"], self.scene_box),
+            check_lenses(self.train_cameras),
+        )
+        yield from (finding for finding in checks if finding is not None)
+        yield from check_bands(self.scene, self._noise, self._pixels.bad_share)
         if self.scene.has_backdrop:
-            found.append(
-                "pictures have no alpha, but share a plain backdrop: it is learnt as what lies behind the scene, and "
-                "nothing is sought where they show it (--world bounded or unbounded does without)"
-            )
-        found += rig_warnings(self.scene, self._initial_data["reachable"]) if self._is_rig else []
-        return [warning for warning in found if warning is not None]
+            yield Finding.of(Message.PLAIN_BACKDROP)
+        if self._is_rig:
+            yield from check_rig(self.scene, self._initial_data["reachable"])
 
     def identity(self, summary: Mapping[str, Any]) -> dict[str, Any]:
         """Views, cameras, bands and the hashes of what was measured."""
@@ -287,7 +304,7 @@ class HyperspectralDataManager(DataManager):
         return AlphaEvidence(self._pixels, self.scene.has_alpha and not self.options.trust_alpha)
 
     @cached_property
-    def _carved(self) -> tuple[Cells, str | None]:
+    def _carved(self) -> tuple[Cells, Finding | None]:
         """Where something may be, and what to say of masks that contradict each other; all pixels are read for it."""
         foreground = self._foreground
         hull = self._surfaces.carved(carve(self.scene, self.options.grid_resolution, foreground))
@@ -295,9 +312,7 @@ class HyperspectralDataManager(DataManager):
             foreground is None or self.scene.is_unbounded or self.scene.has_backdrop
         ):  # which was tried by that
             return hull, None
-        found = check_masks(share_contradicted(self.train_cameras, foreground, self.scene_box))
-        advice = "Poses may be off by some pixels (--poses refine corrects them), or masks have holes"
-        return hull, None if found is None else found.sentence(advice)
+        return hull, check_masks(share_contradicted(self.train_cameras, foreground, self.scene_box))
 
     @property
     def _foreground(self) -> Masks | None:

@@ -73,11 +73,12 @@ def read_numbers(value: Any, *shape: int) -> np.ndarray | None:
 Keys = TypeVar("Keys", bound=msgspec.Struct)
 
 
-def read_keys(values: Mapping[str, Any], schema: type[Keys], note: Callable[[str], Any]) -> Keys:
+def read_keys(values: Mapping[str, Any], schema: type[Keys], note: Callable[..., Any]) -> Keys:
     """What an object holds of the keys of a schema; None for those that are absent, null or wrong.
 
     Args:
-        note: Takes a message for each key whose value is wrong.
+        note: Takes `key`, the value that was `found` and what was `expected` of each key whose value is wrong, in
+        words.
     """
     found = {}
     for key, (kind, expected) in _kinds(schema).items():
@@ -87,7 +88,7 @@ def read_keys(values: Mapping[str, Any], schema: type[Keys], note: Callable[[str
         try:
             found[key] = msgspec.convert(value, kind)
         except msgspec.ValidationError:
-            note(f"'{key}' is {describe(value)}; expected {expected}")
+            note(key=key, found=describe(value), expected=expected)
     return schema(**found)
 
 

@@ -1,9 +1,8 @@
 """What training views are evidence of: where alpha can be trusted, how bright places are, what each band is worth.
 
-The rules for single pixels are in `spectral.evidence`; here they are applied sensor by sensor, with what a user should
-know of them before training.
+The rules for single pixels are in `spectral.evidence`; here they are applied sensor by sensor.
 
-Notation: `B` bands of the scene, `G` groups, `P` points, `R` pixels.
+Notation: `B` bands of the scene, `G` groups, `R` pixels.
 """
 
 from __future__ import annotations
@@ -14,9 +13,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from unmix_plugin.scenes.geometry.carving import Cells, Masks
+from unmix_plugin.scenes.geometry.carving import Masks
 from unmix_plugin.scenes.geometry.lighting import Pictures, local_log_brightness
-from unmix_plugin.scenes.geometry.views import look_up
 from unmix_plugin.scenes.pixel_block import DrawnPixels, PixelBlock
 from unmix_plugin.scenes.pixel_table import PixelTable
 from unmix_plugin.scenes.scene import Scene
@@ -37,11 +35,6 @@ _COLOUR_GROUPS = 24
 _LIT_BEST = 0.9
 """Quantile of a group's brightness that stands for full light."""
 _PIXELS_TO_JUDGE_BY = 20_000
-_LEAST_OVERLAP = 0.1
-"""Share of what a sensor sees that another must see too."""
-_MOST_POINTS = 4000
-_FEWEST_BAD = 1e-5
-"""Share of bad values below which nothing is said."""
 
 
 class AlphaEvidence:
@@ -154,66 +147,3 @@ def relative_power(scene: Scene, opaque: Float[Tensor, "R B"]) -> float:
     dark pixels must not count more: 0."""
     knows_empty = scene.has_alpha and not scene.is_unbounded
     return relative_power_of(opaque) if knows_empty else 0.0
-
-
-def noise_warnings(scene: Scene, noise: dict[int, BandNoise], bad_share: float) -> list[str]:
-    """Bands that are mostly noise or dead, and how many values were replaced."""
-    said = []
-    for sensor, found in noise.items():
-        bands = scene.wavelengths_nm[list(scene.sensors[sensor].bands or ())]
-        whose = f" of sensor {scene.sensors[sensor].name!r}" if scene.is_rig else ""
-        for chosen, what, why in (
-            (found.mostly_noise, "mostly noise", "hardly count in training"),
-            (found.dead, "dead", "show one value everywhere and hardly count in training"),
-        ):
-            named = ", ".join(f"{nm:g}" for nm in bands[chosen.numpy()])
-            which = f"bands at {named} nm{whose} are" if "," in named else f"band {named} nm{whose} is"
-            if named:
-                said.append(f"{which} {what}: its errors {why}; leave it out where you can")
-    if bad_share > _FEWEST_BAD:
-        said.append(
-            f"{bad_share:.2g} of all measured values stand out from the bands and pixels around them (stripes, "
-            "spikes); training uses what is around them instead (--pipeline.datamanager.no-mend-values keeps them)"
-        )
-    return said
-
-
-def rig_warnings(scene: Scene, reachable: Cells) -> list[str]:
-    """Sensors of a rig that share no band with another, or look at other parts of the scene: of cells where something
-    may be."""
-    used = sorted({scene.frames[view].sensor for view in scene.train_indices})
-    seen = np.array([scene.sensors[index].seen_bands for index in used])
-    is_shared = seen.sum(axis=0) > 1
-    alone = [
-        scene.sensors[index].name
-        for index, own in zip(used, seen, strict=True)
-        if len(used) > 1 and not (own & is_shared).any()
-    ]
-    said = []
-    if alone:
-        said.append(
-            f"no other sensor shares a band with {', '.join(alone)}: only their poses hold their spectra together"
-        )
-    for name, share in _overlaps(scene, used, reachable):
-        if share < _LEAST_OVERLAP:
-            said.append(
-                f"of what sensor {name!r} sees, the other sensors see {share:.0%} (expected at least "
-                f"{_LEAST_OVERLAP:.0%}): nothing joins their spectra; check the poses and lenses of the rig"
-            )
-    return said
-
-
-def _overlaps(scene: Scene, sensors: list[int], reachable: Cells) -> list[tuple[str, float]]:
-    """Names of sensors, and of the places that each sees the share that another sees too."""
-    cells = np.argwhere(reachable)
-    cells = cells[:: max(1, -(-len(cells) // _MOST_POINTS))]
-    unit = torch.from_numpy((cells + 0.5) / np.array(reachable.shape)).float()
-    points = scene.scene_box.aabb[0] + unit * scene.scene_box.size
-    seen = {sensor: np.zeros(len(points), bool) for sensor in sensors}
-    for view in scene.train_indices:
-        seen[scene.frames[view].sensor] |= look_up(scene.cameras, view, points)[2].numpy()
-    found = []
-    for sensor, own in seen.items() if len(sensors) > 1 else ():
-        others = np.any([seen[other] for other in sensors if other != sensor], axis=0)
-        found.append((scene.sensors[sensor].name, float((own & others).sum() / max(own.sum(), 1))))
-    return found

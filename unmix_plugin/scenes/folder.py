@@ -27,6 +27,7 @@ from msgspec import Meta
 
 from unmix_plugin.formats.json_values import UnreadableJsonError, describe, read_json_file, read_keys
 from unmix_plugin.limits import GREATEST_PX
+from unmix_plugin.scenes.messages import Message
 from unmix_plugin.scenes.reading.faults import FILE_NAME, Faults
 
 CUBE_KEY = "hyperspectral_file_path"
@@ -230,12 +231,12 @@ def refused_keys(scene: Mapping[str, Any], frame: Mapping[str, Any], is_scene: b
     "'k6' is set, which stands for radial terms of higher "
     """
     refused = [
-        f"'{key}' is set, which stands for {meaning}"
+        Message.KEY_REFUSED.sentence(key=key, meaning=meaning)
         for key, meaning in (_REFUSED | (_ONLY_IN_CAPTURES if is_scene else {})).items()
         if _is_set(frame.get(key, scene.get(key)))
     ]
     return refused + [
-        f"has a '{key}' of its own; all cubes of a scene share one: give it beside 'frames', and change the cubes to it"
+        Message.KEY_OF_ONE_CUBE.sentence(key=key)
         for key in _OF_ALL_CUBES
         if frame.get(key) not in (None, scene.get(key))
     ]
@@ -248,7 +249,7 @@ def unfollowed_keys(
     frames = list(frames)
     every = [scene, *frames]
     warnings = [
-        f"'{key}' is set and not followed: it stands for {meaning}"
+        Message.KEY_NOT_FOLLOWED.sentence(key=key, meaning=meaning)
         for key, meaning in _NOT_FOLLOWED.items()
         if any(_is_set(values.get(key)) for values in every)
     ]
@@ -258,31 +259,24 @@ def unfollowed_keys(
         if scene.get(key) is not None and any(one.get(key) not in (None, scene[key]) for one in frames)
     ]
     if twice and not any("sensor" in one for one in frames):  # which nerfstudio has no word for
-        warnings.append(
-            f"{', '.join(twice)}: frames have other values than the scene; the frames' are used, nerfstudio takes the "
-            "scene's. Take out those that are wrong"
-        )
+        warnings.append(Message.LENS_TWICE.sentence(keys=", ".join(twice)))
     if len({repr(one["time"]) for one in frames if "time" in one}) > 1:
-        warnings.append("frames have a 'time': what moves between views is taken to stand still")
+        warnings.append(Message.TIME.sentence())
     of_scenes = {*WorldKeys.__struct_fields__, *SceneKeys.__struct_fields__}
     of_frames = set(FrameKeys.__struct_fields__)
     if misplaced := [key for key in scene if key in of_frames and _is_set(scene[key])]:
-        warnings.append(
-            f"{', '.join(misplaced)}: not followed beside 'frames'; give it in each frame that it is for"
-        )
+        warnings.append(Message.NOT_BESIDE_FRAMES.sentence(keys=", ".join(misplaced)))
     in_frames = [
         key
         for key in sorted(of_scenes.difference(_OF_ALL_CUBES))
         if any(one.get(key) not in (None, scene.get(key)) for one in frames)
     ]
     if in_frames:
-        warnings.append(
-            f"{', '.join(in_frames)}: not followed in frames; give it beside 'frames', for all of them"
-        )
+        warnings.append(Message.NOT_IN_FRAMES.sentence(keys=", ".join(in_frames)))
     known = of_scenes.union(of_frames, LensKeys.__struct_fields__, _HINTS)
     known |= {*_REFUSED, *_ONLY_IN_CAPTURES, *_NOT_FOLLOWED}
     unknown = sorted({key for values in every for key in values} - known)
-    notes = [f"keys that are not known and not used: {', '.join(unknown[:8])}"] if unknown else []
+    notes = [Message.UNKNOWN_KEYS.sentence(keys=", ".join(unknown[:8]))] if unknown else []
     return warnings, notes
 
 
@@ -300,20 +294,20 @@ def _is_set(value: Any) -> bool:
 
 def read_frame_keys(frame: Mapping[str, Any], where: str, faults: Faults) -> FrameKeys:
     """The keys of a frame, checked; whether its bands exist is asked later."""
-    keys = read_keys(frame, FrameKeys, partial(faults.add, where))
+    keys = read_keys(frame, FrameKeys, partial(faults.note, where, Message.WRONG_VALUE))
     if frame.get("bands") is None:
         return keys
     if frame.get("responses_path") is not None:
-        faults.add(where, "has 'bands' and 'responses_path'; a sensor has one of them, drop the other")
+        faults.note(where, Message.BANDS_AND_RESPONSES)
     repeated = sorted(band for band, count in Counter(keys.bands).items() if count > 1)
     if repeated:
-        faults.add(where, f"'bands' repeats {', '.join(map(str, repeated))}; expected each band once")
+        faults.note(where, Message.BANDS_REPEAT, bands=", ".join(map(str, repeated)))
     return keys
 
 
 def read_scene_keys(scene: Mapping[str, Any], faults: Faults) -> SceneKeys:
     """The keys of a scene, each checked by itself."""
-    return read_keys(scene, SceneKeys, partial(faults.add, FILE_NAME))
+    return read_keys(scene, SceneKeys, partial(faults.note, FILE_NAME, Message.WRONG_VALUE))
 
 
 # Reading and writing.
@@ -334,25 +328,24 @@ def load_transforms(root: Path, faults: Faults) -> Transforms:
     it is absent, no JSON object, or has no list of frames, so that there is nothing to go on with."""
     content: Any = None
     if not root.is_dir():
-        found = "is a file, not a scene folder" if root.is_file() else "the scene folder is not there"
-        faults.add(str(root), f"{found}; give the folder that holds transforms.json with --data")
+        faults.note(str(root), Message.FOLDER_IS_FILE if root.is_file() else Message.NO_FOLDER)
     elif not (root / FILE_NAME).is_file():
-        faults.add(FILE_NAME, "is not in the scene folder; unmix-process makes a scene of raw files")
+        faults.note(FILE_NAME, Message.NO_FILE)
     else:
         try:
             content = read_json_file(root / FILE_NAME)
             if not isinstance(content, dict):
-                faults.add(FILE_NAME, f"holds {describe(content)}; expected an object with 'frames'")
+                faults.note(FILE_NAME, Message.NO_OBJECT, found=describe(content))
         except OSError as error:
-            faults.add(FILE_NAME, f"cannot be read ({error.strerror})")
+            faults.note(FILE_NAME, Message.FILE_UNREADABLE, reason=error.strerror)
         except UnreadableJsonError as error:
-            faults.add(FILE_NAME, str(error))
+            faults.note(FILE_NAME, Message.NO_JSON, reason=error)
     faults.raise_if_any()
     transforms = parse_transforms(content, faults)
     if not isinstance(content.get("frames"), list):
         faults.raise_if_any()
     if content["frames"] == []:
-        faults.add(FILE_NAME, "'frames' is empty; a scene needs frames to train on and to evaluate")
+        faults.note(FILE_NAME, Message.NO_FRAMES)
     return transforms
 
 
@@ -368,12 +361,12 @@ def parse_transforms(content: Any, faults: Faults, key: str = "frames", what: st
     frames = scene.get(key) if isinstance(content, dict) else content
     if not isinstance(frames, list):
         found = "is absent" if frames is None else f"is {describe(frames)}"
-        faults.add(faults.file, f"'{key}' {found}; expected a list with one object a {what}")
+        faults.note(faults.file, Message.NO_LIST, key=key, found=found, what=what)
         return Transforms(scene, ())
     named = [(f"{key}[{index}]", frame) for index, frame in enumerate(frames)]
     for where, frame in named:
         if not isinstance(frame, dict):
-            faults.add(where, f"is {describe(frame)}; expected an object")
+            faults.note(where, Message.FRAME_NO_OBJECT, found=describe(frame))
     return Transforms(scene, tuple((where, frame) for where, frame in named if isinstance(frame, dict)))
 
 

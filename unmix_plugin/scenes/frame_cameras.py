@@ -21,6 +21,7 @@ from unmix_plugin.engine.geometry.key_poses import KeyPoses
 from unmix_plugin.formats.json_values import describe, read_keys, read_number, read_numbers
 from unmix_plugin.limits import GREATEST_PX
 from unmix_plugin.scenes.folder import LensKeys, refused_keys
+from unmix_plugin.scenes.messages import Message
 from unmix_plugin.scenes.reading.faults import Faults
 
 _SUPPORTED_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV")
@@ -100,7 +101,7 @@ def read_lens(
         hidden |= {"fl_x", "fl_y"}  # a field of view of the frame goes before the scene's focal length
     common = {key: value for key, value in common.items() if key not in hidden and key not in own}
     lens, shared = (
-        read_keys(values, LensKeys, partial(faults.add, place))
+        read_keys(values, LensKeys, partial(faults.note, place, Message.WRONG_VALUE))
         for values, place in ((own, where), (common, faults.file))
     )
     number: dict[str, float | None] = {}
@@ -112,7 +113,7 @@ def read_lens(
     )
     if number["is_fisheye"]:
         if model not in (None, "OPENCV_FISHEYE"):
-            faults.add(where, f"'is_fisheye' is true and camera_model {describe(model)}; drop one of them")
+            faults.note(where, Message.FISHEYE_CONTRADICTED, model=describe(model))
         model = "OPENCV_FISHEYE"
     if faults.noted > noted_before:
         return None
@@ -143,22 +144,18 @@ def _in_our_keys(values: Mapping[str, Any], where: str, faults: Faults) -> dict[
         rows = matrix[:3] if isinstance(matrix, list) else []
         numbers = read_numbers([row[:3] if isinstance(row, list) else row for row in rows], 3, 3)
         if numbers is None:
-            faults.add(
-                where, f"'intrinsic_matrix' is {describe(matrix)}; expected 3 rows of 3 numbers in pixels"
-            )
+            faults.note(where, Message.NO_MATRIX, found=describe(matrix))
         else:
             (fx, skew, cx), (_, fy, cy), _ = numbers.tolist()
             found = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}
             if min(fx, fy) <= 0 or abs(skew) > 1e-6 * fx:
-                has = f"focal lengths {fx:g}, {fy:g} and skew {skew:g}"
-                faults.add(where, f"'intrinsic_matrix' has {has}; expected focal lengths above 0 and no skew")
+                faults.note(where, Message.SKEWED_MATRIX, fx=fx, fy=fy, skew=skew)
                 found = {}
     found |= {key: value for key, value in values.items() if value is not None}
     if listed is not None:
         terms = read_numbers(listed, len(_TERMS))
         if terms is None or np.abs(terms).max() > GREATEST_PX:
-            expected = ", ".join(_TERMS)
-            faults.add(where, f"'distortion_params' is {describe(listed)}; expected the numbers {expected}")
+            faults.note(where, Message.NO_TERMS, found=describe(listed), terms=", ".join(_TERMS))
         else:
             found |= zip(_TERMS, terms.tolist(), strict=True)
     return {
@@ -176,19 +173,16 @@ def read_scene_lens(
     lens = read_lens(scene, frame, where, faults, is_scene=True)
     model = "OPENCV" if lens is None else lens.model
     if model not in _SUPPORTED_MODELS:
-        faults.add(
-            where if frame.get("camera_model") is not None else faults.file,
-            f"camera_model {describe(model)} is not supported; expected one of {', '.join(_SUPPORTED_MODELS)}: "
-            "unmix-process brings such pictures into an OPENCV lens",
-        )
+        owner = where if frame.get("camera_model") is not None else faults.file
+        faults.note(owner, Message.LENS_MODEL, model=describe(model), known=", ".join(_SUPPORTED_MODELS))
     focal_keys = ("fl_x", "camera_angle_x", "x_fov", "intrinsic_matrix")
     if all(values.get(key) is None for values in (frame, scene) for key in focal_keys):
-        faults.add(where, "'fl_x' is absent; expected the focal length in pixels, of a frame or the scene")
+        faults.note(where, Message.NO_FOCAL_LENGTH)
     if lens is not None and model in ("PINHOLE", "SIMPLE_PINHOLE"):
         (k1, k2, p1, p2), (k3, k4) = lens.distortion, lens.higher_radial
         terms = dict(zip(_TERMS, (k1, k2, k3, k4, p1, p2), strict=True))
         if any(terms.values()):
-            faults.add(where, f"camera_model {model} comes with distortion {terms}; expected OPENCV or zeros")
+            faults.note(where, Message.PINHOLE_DISTORTED, model=model, terms=terms)
     return None if faults.noted > noted_before else lens
 
 
@@ -210,26 +204,20 @@ def read_pose(
             if wrong:
                 found += f" with {describe(wrong[0])} in row {number}"
                 break
-        return faults.add(
-            where, f"{name} {found}; expected 4 (or 3) rows of 4 finite numbers, camera to world"
-        )
+        return faults.note(where, Message.NO_POSE, name=name, found=found)
     if len(rows) == 4 and np.abs(rows[3] - (0, 0, 0, 1)).max() > 1e-6:
         last = ", ".join(f"{value:g}" for value in rows[3])
-        return faults.add(where, f"{name} is not rigid: its last row is ({last}); expected (0, 0, 0, 1)")
+        return faults.note(where, Message.LAST_ROW, name=name, row=last)
     rotation, position = rows[:3, :3], rows[:3, 3]
     with np.errstate(over="ignore", invalid="ignore"):
         deviation = np.abs(rotation.T @ rotation - np.eye(3)).max()
     if not deviation <= _RIGID_TOLERANCE:
         lengths = ", ".join(f"{math.hypot(*axis):.4g}" for axis in rotation.T)  # hypot does not overflow
-        message = f"{name} is not rigid: its axes have lengths ({lengths}) and R^T R is off the identity"
-        return faults.add(where, f"{message} by {deviation:.3g}; expected a rotation without scale or shear")
+        return faults.note(where, Message.NOT_RIGID, name=name, lengths=lengths, deviation=deviation)
     if np.linalg.det(rotation) < 0.0:
-        return faults.add(
-            where, f"{name} is a reflection (determinant -1); expected a rotation, flip one axis"
-        )
+        return faults.note(where, Message.REFLECTION, name=name)
     if np.abs(position).max() > _MAX_DISTANCE:
-        found = f"puts the camera at {position.tolist()}"
-        return faults.add(where, f"{name} {found}; expected less than 1e9 units away")
+        return faults.note(where, Message.FAR_AWAY, name=name, position=position.tolist())
     u, _, vt = np.linalg.svd(rotation)
     return np.concatenate([u @ vt, position[:, None]], axis=1)
 
@@ -252,11 +240,11 @@ def read_line_poses(frame: Mapping[str, Any], where: str, faults: Faults) -> Lin
     if given in ([], ["transform_matrix"]):
         return None
     if len(given) > 1:
-        return faults.add(where, f"has {' and '.join(repr(key) for key in given)}; expected one of them")
+        return faults.note(where, Message.SEVERAL_POSES, keys=" and ".join(map(repr, given)))
     [key] = given
     entries = frame[key]
     if not isinstance(entries, list) or len(entries) < 2:
-        return faults.add(where, f"'{key}' is {describe(entries)}; expected a list of at least two poses")
+        return faults.note(where, Message.NO_LINE_POSES, key=key, found=describe(entries))
     rows, poses = [], []
     for index, entry in enumerate(entries):
         row, pose = _read_line_pose(entry, index, key == _KEY_POSES, f"{where} '{key}'[{index}]", faults)
@@ -264,7 +252,7 @@ def read_line_poses(frame: Mapping[str, Any], where: str, faults: Faults) -> Lin
         if row is None or pose is None:
             return None
         if rows and row <= rows[-1]:
-            return faults.add(where, f"the rows of '{key}' must increase; got {rows[-1]:g} then {row:g}")
+            return faults.note(where, Message.ROWS_FALL, key=key, before=rows[-1], after=row)
         rows.append(row)
         poses.append(pose)
     stacked = np.stack(poses)
@@ -272,9 +260,9 @@ def read_line_poses(frame: Mapping[str, Any], where: str, faults: Faults) -> Lin
     turns = np.rad2deg(np.arccos(np.clip((products - 1) / 2, -1, 1)))
     largest = int(turns.argmax())
     if turns[largest] > _GREATEST_TURN_DEG:
-        found = f"the camera turns by {turns[largest]:.0f} degrees from row {rows[largest]:g} to row"
-        most = f"expected at most {_GREATEST_TURN_DEG:g}, give more key poses"
-        return faults.add(where, f"{found} {rows[largest + 1]:g}; {most}")
+        before, after = rows[largest : largest + 2]
+        values = {"turn": turns[largest], "before": before, "after": after, "most": _GREATEST_TURN_DEG}
+        return faults.note(where, Message.GREAT_TURN, **values)
     return LinePoses(np.array(rows), stacked, key == _ROW_POSES)
 
 
@@ -287,9 +275,9 @@ def _read_line_pose(
     keys = entry if isinstance(entry, dict) else {}
     row = read_number(keys.get("row"))
     if row is None:
-        found = f"has the row {describe(keys.get('row'))}" if keys else f"is {describe(entry)}"
-        faults.add(where, f"{found}; expected an object with 'row' (a number) and 'transform_matrix'")
-        return None, None
+        if keys:
+            return faults.note(where, Message.NO_ROW, found=describe(keys.get("row"))), None
+        return faults.note(where, Message.NO_KEY_POSE, found=describe(entry)), None
     return row, read_pose(keys.get("transform_matrix"), where, faults)
 
 
@@ -320,12 +308,9 @@ class FrameCamera:
             return self
         first, last = float(self.lines.rows[0]), float(self.lines.rows[-1])
         if self.lines.is_by_row and len(self.lines.rows) != num_rows:
-            found = f"'{_ROW_POSES}' has {len(self.lines.rows)} poses, but the image has {num_rows} rows"
-            faults.add(where, f"{found}; expected one pose a row")
+            faults.note(where, Message.ROW_POSES_MISFIT, poses=len(self.lines.rows), rows=num_rows)
         elif first > 0 or last < num_rows - 1:
-            found = f"'{_KEY_POSES}' reach from row {first:g} to row {last:g}"
-            rows = f"the image has rows 0 to {num_rows - 1}"
-            faults.add(where, f"{found}, but {rows}; expected key poses at both ends or beyond")
+            faults.note(where, Message.KEY_POSES_END, first=first, last=last, rows=num_rows - 1)
         count = len(self.lines.rows)
         keys = KeyPoses(torch.from_numpy(self.lines.poses), torch.from_numpy(self.lines.rows), (count,))
         middle = torch.tensor([0.5 * (num_rows - 1)], dtype=torch.float64)

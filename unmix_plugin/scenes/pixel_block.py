@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from unmix_plugin.errors import SceneError
+from unmix_plugin.scenes.messages import Message
 from unmix_plugin.scenes.pixel_pool import PixelPool
 from unmix_plugin.scenes.pixel_projection import Pixels, ProjectedPixels, Projection, Spectra
 from unmix_plugin.scenes.reading.cubes import Part
@@ -249,10 +250,8 @@ class PixelBlock:
         try:
             cube = self._scene.stored_cube(view, part) if self._is_compact else self._scene.cube(view, part)
         except (OSError, ValueError) as error:
-            raise SceneError(
-                f"{self._scene.frames[view].cube_path}: the cube can't be read any more ({error}); a scene must stay "
-                "as it is while it is trained on"
-            ) from error
+            path = self._scene.frames[view].cube_path
+            raise SceneError(Message.CUBE_CHANGED.sentence(path=path, reason=error)) from error
         return torch.from_numpy(cube.reshape(-1, self.num_channels).view(self._kept))
 
     def _read_range(self, first: int, last: int) -> Tensor:

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from unmix_plugin.scenes.messages import Message
 from unmix_plugin.spectral.subspace import find_subspace
 
 Pixels = Int[Tensor, " R"]
@@ -61,11 +62,9 @@ class Projection:
 
     def describe(self) -> str:
         """What a user should know."""
-        return (
-            f"training pixels are kept as {len(self.subspace)} numbers instead of {self.num_channels} "
-            f"(target-components): what they leave out is {self.residual:.2g} of the noise; {self.whole_share:.2%} of "
-            "the pixels, where it would be more or which are saturated, are kept whole"
-        )
+        values = {"kept": len(self.subspace), "channels": self.num_channels}
+        values |= {"residual": self.residual, "whole": self.whole_share}
+        return Message.KEPT_AS_COMPONENTS.sentence(**values)
 
 
 class ProjectedPixels:

@@ -25,6 +25,7 @@ from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.engine.machine import step_generator
 from unmix_plugin.engine.processes import processes_here
 from unmix_plugin.errors import ConfigError
+from unmix_plugin.scenes.messages import Message
 from unmix_plugin.scenes.pixel_block import DrawnPixels, PixelBlock
 from unmix_plugin.scenes.pixel_projection import FEWEST_CHANNELS, Projection
 from unmix_plugin.scenes.scene import Scene
@@ -107,7 +108,7 @@ class PixelTable:
         )
         self._firsts = list(accumulate((len(block) for block in self.blocks), initial=0))
         if not any(bool(block.valid.any()) for block in self.blocks):
-            raise ConfigError("no valid pixel is left in the training views: masks leave out every one")
+            raise ConfigError(Message.NO_VALID_PIXEL.sentence())
         self._scene, self._seed, self._mends = scene, seed, mends
         self.notes = self._read(_budget_bytes(device, memory_gb), memory_gb is None, components)
         """What a user should know of pixels that are not held as they were stored."""
@@ -151,18 +152,11 @@ class PixelTable:
         """What stays on disk, in words, and that components don't help, which need at least so many bytes."""
         held = sum(block.pool.num_bytes for block in self.blocks if block.pool is not None)
         what = " and ".join(block.description for block in self.blocks)
-        said = (
-            f"the training pixels stay on disk: {what} are {total / _GIB:.3g} GiB; {held / _GIB:.3g} GiB of them are "
-            "in memory at a time, and others are read while training goes on (memory-gb)"
-        )
-        if isinstance(components, str):
-            return [said]
-        no_effect = (
-            f"target-components {components} has no effect: even as so many numbers each the training pixels need at "
-            f"least {needed / _GIB:.3g} GiB, and pixels on disk keep all bands; choose fewer, or more memory "
-            "(memory-gb)"
-        )
-        return [said, no_effect]
+        notes = [Message.KEPT_ON_DISK.sentence(what=what, total=total / _GIB, held=held / _GIB)]
+        if not isinstance(components, str):
+            values = {"components": components, "needed": needed / _GIB}
+            notes.append(Message.COMPONENTS_OF_NO_USE.sentence(**values))
+        return notes
 
     def _projected(self, components: Components) -> dict[int, Projection]:
         """By sensor, of blocks whose pixels are to be kept as components."""

@@ -16,6 +16,7 @@ from jaxtyping import Float, Float64
 
 from unmix_plugin.formats.json_values import describe, read_keys, read_numbers
 from unmix_plugin.scenes.folder import WorldKeys
+from unmix_plugin.scenes.messages import Message
 from unmix_plugin.scenes.reading.faults import Faults
 
 _ROTATION_TOLERANCE = 1e-5
@@ -121,7 +122,7 @@ def read_placement(scene: Mapping[str, Any], where: str, faults: Faults) -> tupl
 
     `offset` counts beside one of the other two only, and not in files of instant-ngp, where it means something else.
     """
-    keys = read_keys(scene, WorldKeys, partial(faults.add, where))
+    keys = read_keys(scene, WorldKeys, partial(faults.note, where, Message.WRONG_VALUE))
     given = keys.applied_transform
     rows = given[:3] if isinstance(given, list) and given[3:] == [[0, 0, 0, 1]] else given
     transform = np.eye(3, 4) if given is None else read_numbers(rows, 3, 4)
@@ -132,17 +133,13 @@ def read_placement(scene: Mapping[str, Any], where: str, faults: Faults) -> tupl
             is_rotation = bool(np.abs(rotation.T @ rotation - np.eye(3)).max() <= _ROTATION_TOLERANCE)
         is_rotation = is_rotation and float(np.linalg.det(rotation)) > 0
     if transform is None or not is_rotation:
-        faults.add(
-            where,
-            f"'applied_transform' is {describe(given)}; expected 3 rows of 4 numbers, a rotation and a translation; "
-            "put scale into 'applied_scale', or drop the key",
-        )
+        faults.note(where, Message.WRONG_TRANSFORM, found=describe(given))
         transform = np.eye(3, 4)
     is_ours = any(scene.get(key) is not None for key in ("applied_transform", "applied_scale"))
     offset = keys.offset if is_ours and not any(key in scene for key in _OTHER_OFFSETS) else None
     shift = np.zeros(3) if offset is None else read_numbers(offset, 3)
     if shift is None:
-        faults.add(where, f"'offset' is {describe(offset)}; expected 3 finite numbers")
+        faults.note(where, Message.WRONG_OFFSET, found=describe(offset))
         shift = np.zeros(3)
     scale = 1.0 if keys.applied_scale is None else keys.applied_scale
     return Placement(transform[:, :3], transform[:, 3], scale, shift), keys.metres_per_unit

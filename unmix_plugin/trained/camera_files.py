@@ -41,6 +41,7 @@ from unmix_plugin.scenes.folder import (
     transforms_bytes,
 )
 from unmix_plugin.scenes.frame_cameras import FrameCamera, Intrinsics, make_cameras, read_pose
+from unmix_plugin.scenes.messages import Message
 from unmix_plugin.scenes.placement import read_placement
 from unmix_plugin.scenes.reading.faults import Faults
 from unmix_plugin.scenes.scene import Normalisation
@@ -130,7 +131,7 @@ def read_camera_file(path: Path, frame: Normalisation) -> _CameraFile:
         )
     is_path = "camera_path" in content
     faults = Faults(path)
-    keys = read_keys(content, _FileKeys, partial(faults.add, str(path)))
+    keys = read_keys(content, _FileKeys, partial(faults.note, str(path), Message.WRONG_VALUE))
     cameras = parse_transforms(content, faults, "camera_path" if is_path else "frames", "camera")
     faults.raise_if_any(ConfigError)
     if not cameras.frames:
@@ -199,7 +200,7 @@ def _read_path(
     views = []
     for index, (where, entry) in enumerate(entries):
         faults = Faults(path)
-        own = read_keys(entry, _PathKeys, partial(faults.add, where))
+        own = read_keys(entry, _PathKeys, partial(faults.note, where, Message.WRONG_VALUE))
         if entry.get("fov") is None:
             faults.add(where, "'fov' is absent; expected a number")
         values = own.camera_to_world

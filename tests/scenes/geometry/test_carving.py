@@ -13,11 +13,12 @@ from tests.scenes.scene_factory import ball_alpha, cameras_of, look_at, make_sce
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import rotation_matrix
 from unmix_plugin.scenes.demo.scene import make_demo_scene
-from unmix_plugin.scenes.doctor import Code, check_masks
+from unmix_plugin.scenes.doctor import check_masks
 from unmix_plugin.scenes.evidence import AlphaEvidence
 from unmix_plugin.scenes.geometry import carving
 from unmix_plugin.scenes.geometry.bounds import find_bounds
 from unmix_plugin.scenes.geometry.carving import _needed_witnesses, carve_box, foreground_rays
+from unmix_plugin.scenes.messages import Message
 from unmix_plugin.scenes.pixel_table import PixelTable
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.scenes.scene import Scene
@@ -237,8 +238,8 @@ def test_poses_that_are_off_by_several_pixels_are_told_and_right_ones_raise_no_a
     foreground = [alpha > 0 for alpha in alphas if alpha is not None]
     cameras = scene.cameras[list(scene.train_indices)]
     found = check_masks(carving.share_contradicted(cameras, foreground, scene.scene_box))
-    assert (None if found is None else found.code) == (Code.MASKS_CONTRADICT if is_told else None)
-    assert found is None or found.share > 0.05
+    assert (None if found is None else found.code) == (Message.MASKS_CONTRADICT if is_told else None)
+    assert found is None or found.values["share"] > 0.05
 
 
 def test_a_point_on_the_right_or_lower_edge_of_an_image_is_outside_as_everywhere():

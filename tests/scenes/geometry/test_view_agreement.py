@@ -12,12 +12,10 @@ from tests.scenes.scene_factory import look_at, make_scene
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes.demo.scene import make_demo_scene
-from unmix_plugin.scenes.geometry import view_agreement
+from unmix_plugin.scenes.doctor import check_lenses, check_parallax, check_poses
 from unmix_plugin.scenes.geometry.view_agreement import (
     compare_conventions,
     compare_scene_conventions,
-    describe,
-    lens_warning,
 )
 from unmix_plugin.scenes.geometry.views import Views
 from unmix_plugin.scenes.reading.loader import load_scene
@@ -59,7 +57,7 @@ def rewritten(demo, folder, change=lambda pose: pose, with_alpha=True, shift=0.0
 @pytest.mark.parametrize("with_alpha", [True, False])
 def test_right_poses_raise_no_alarm_far_from_the_origin(demo, tmp_path, with_alpha):
     scene = load_scene(rewritten(demo, tmp_path / "scene", with_alpha=with_alpha, shift=1000.0))
-    assert describe(compare_scene_conventions(scene)) is None
+    assert check_poses(compare_scene_conventions(scene)) is None
 
 
 TURN = [[0, 0, 1, 0.5], [1, 0, 0, -2], [0, 1, 0, 0.25]]
@@ -73,7 +71,8 @@ def test_conventions_are_told_in_scenes_turned_and_geo_referenced(demo, tmp_path
     path = folder / "transforms.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | ({} if with_alpha else APPLIED)))
     try:
-        said = describe(compare_scene_conventions(load_scene(folder)))
+        found = check_poses(compare_scene_conventions(load_scene(folder)))
+        said = None if found is None else found.sentence()
     except SceneError as error:
         said = str(error)
     assert said is None if wrong is None else f"the poses look like {wrong}" in str(said)
@@ -89,7 +88,7 @@ def test_the_remedy_of_the_warning_mends_the_poses(demo, tmp_path):
     (warning,) = [said for said in warnings_of(as_colmap) if "the poses look like" in said]
     assert "invert each, then multiply it from the right by diag(1, -1, -1, 1)" in warning
     mended = rewritten(as_colmap, tmp_path / "mended", lambda pose: np.linalg.inv(pose) @ FLIP)
-    assert describe(compare_scene_conventions(load_scene(mended))) is None
+    assert check_poses(compare_scene_conventions(load_scene(mended))) is None
 
 
 def test_views_that_show_nothing_give_no_verdict(demo):
@@ -125,7 +124,7 @@ BOX = SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
 def test_cameras_at_one_place_are_told_from_those_that_are_apart():
     for base, is_said in ((0.0, True), (0.005, True), (0.05, False)):
         positions = np.array([[0.0, 0.0, 4.0], [0.0, 0.0, 4.0], [base, 0.0, 4.0]])
-        assert (view_agreement.parallax_warning(positions, BOX) is not None) == is_said, base
+        assert (check_parallax(positions, BOX) is not None) == is_said, base
 
 
 def test_a_camera_that_only_turns_is_said_before_a_training(tmp_path):
@@ -137,6 +136,6 @@ def test_a_camera_that_only_turns_is_said_before_a_training(tmp_path):
 @pytest.mark.parametrize(("k1", "said"), [(0.0, None), (-0.5, None), (0.5, None), (-4.0, "1 view folds")])
 def test_pixels_to_which_no_direction_leads_are_said(k1: float, said: str | None):
     bent = replace(CAMERA, distortion=torch.tensor([[k1, 0.0, 0.0, 0.0]]))
-    found = lens_warning(bent)
+    found = check_lenses(bent)
     assert (found is not None) == (said is not None)
-    assert (said or "") in (found or "")
+    assert (said or "") in ("" if found is None else found.sentence())

@@ -33,6 +33,7 @@ from unmix_plugin.scenes.geometry.carving import (
     unit_centres,
 )
 from unmix_plugin.scenes.geometry.matched_points import MatchedPoints
+from unmix_plugin.scenes.messages import Message
 
 _OUTLIERS = 0.005
 """Share of the matched places that may lie outside the box, at each of its sides."""
@@ -82,11 +83,7 @@ def find_bounds(cameras: Cameras, foreground: Masks | None, points: MatchedPoint
     count = _count_views(cameras, box, _HULL_CELLS)
     explained = share_through(rays, box, hull & (count >= _HULL_SHARES[0] * count.max()))
     if explained < _MIN_CONSISTENT:
-        raise SceneError(
-            f"alpha and poses contradict: only {explained:.0%} of the pixels that are not transparent have "
-            "a place behind them that no other training view looks through; check that 'transform_matrix' is camera "
-            "to world with OpenGL axes (+y up, looking along -z), and that each picture has its own pose"
-        )
+        raise SceneError(Message.ALPHA_AND_POSES.sentence(share=explained))
     box = _tighten(cameras, rays, box, hull)
     # The second look has finer cells and so a thinner margin.
     return _tighten(cameras, rays, box, carve_box(cameras, foreground, box, _HULL_CELLS))

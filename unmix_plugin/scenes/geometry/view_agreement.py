@@ -23,7 +23,6 @@ from torch import Tensor
 from unmix_plugin.engine.decisions import UNDECIDED, Decision
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
-from unmix_plugin.errors import counted
 from unmix_plugin.scenes.geometry.views import (
     NUM_AGREEING,
     Differences,
@@ -45,13 +44,11 @@ _BUSIEST_SHARE = 0.3
 """Share of a view's pixels, those where it changes most, that are drawn from."""
 _DEPTHS = (0.4, 60.0)
 """Nearest and farthest point along a ray, in median distances between neighbouring cameras."""
-_MOST_DISAGREEMENT = 0.35
+MOST_DISAGREEMENT = 0.35
 """Of the right convention, against that of unrelated pixels: 0.06 to 0.24 on scenes with 5 to 36 views."""
-_LEAST_RATIO = 1.5
+LEAST_RATIO = 1.5
 """Of the given convention's disagreement to the right one's: a wrong one has 1.7 and more."""
 
-_SMALLEST_BASE = 2e-3
-"""Distance between two cameras over that of what they see, below which it moves by hardly more than a pixel."""
 _TILES = 12
 """Along each side of a view: a pixel of each part is asked, since what is far away may be a small part of a view."""
 _NUM_DEPTHS = 160
@@ -73,9 +70,9 @@ such a room costs little where a bounded one cuts its walls off (10 dB)."""
 _LEAST_EXPLAINED = 0.6
 """Of all pixels, those that the inside of a closed box explains: 0.84 in a room, 0.26 in the open."""
 
-_GIVEN = "camera to world, OpenGL axes"
+GIVEN = "camera to world, OpenGL axes"
 _FLIP = np.diag([1.0, -1.0, -1.0])
-_CONVENTIONS = {
+CONVENTIONS = {
     "camera to world, OpenCV axes": (False, True, "multiply each from the right by diag(1, -1, -1, 1)"),
     "world to camera, OpenGL axes": (True, False, "invert each"),
     "world to camera, OpenCV axes (as COLMAP writes them)": (
@@ -84,7 +81,7 @@ _CONVENTIONS = {
         "invert each, then multiply it from the right by diag(1, -1, -1, 1)",
     ),
 }
-"""What a matrix may be other than `_GIVEN`: whether inverted, whether with flipped axes, and what to do with it."""
+"""What a matrix may be other than `GIVEN`: whether inverted, whether with flipped axes, and what to do with it."""
 _Poses = Float64[np.ndarray, "N 3 4"]
 
 
@@ -112,14 +109,14 @@ def compare_scene_conventions(scene: Scene) -> dict[str, float]:
 
 def convention_decision(disagreements: dict[str, float]) -> Decision:
     """What the matrices are taken for, against what they could be; undecided where views share too little to tell."""
-    best = min(disagreements, key=lambda name: disagreements[name], default=_GIVEN)
-    is_clear = bool(disagreements) and disagreements[best] <= _MOST_DISAGREEMENT
-    fits = disagreements.get(_GIVEN, 0.0) < _LEAST_RATIO * disagreements.get(best, 0.0)
+    best = min(disagreements, key=lambda name: disagreements[name], default=GIVEN)
+    is_clear = bool(disagreements) and disagreements[best] <= MOST_DISAGREEMENT
+    fits = disagreements.get(GIVEN, 0.0) < LEAST_RATIO * disagreements.get(best, 0.0)
     return Decision(
         "poses",
-        UNDECIDED if not is_clear else "fit" if fits or best == _GIVEN else f"look like {best}",
+        UNDECIDED if not is_clear else "fit" if fits or best == GIVEN else f"look like {best}",
         {f"views differ as {name}": value for name, value in disagreements.items()},
-        f"the views differ {_LEAST_RATIO:g} times less under another convention, and clearly",
+        f"the views differ {LEAST_RATIO:g} times less under another convention, and clearly",
     )
 
 
@@ -207,28 +204,12 @@ def _with_gaps(thinned: ThinnedViews, view: int) -> Float[Tensor, "h w B"]:
     return image if share is None else image.masked_fill((share < 1)[..., None], torch.nan)
 
 
-def describe(disagreements: dict[str, float]) -> str | None:
-    """A warning, if another convention fits much better than the one expected."""
-    best = min(disagreements, key=lambda name: disagreements[name], default=_GIVEN)
-    if best == _GIVEN or disagreements[best] > _MOST_DISAGREEMENT:
-        return None
-    if disagreements[_GIVEN] < _LEAST_RATIO * disagreements[best]:
-        return None
-    found = disagreements[_GIVEN]
-    given = "they share nothing" if found == float("inf") else f"they differ by {found:.2f}"
-    return (
-        f"the poses look like {best}: read so, the training views differ by {disagreements[best]:.2f} of what "
-        f"unrelated pixels do; read as {_GIVEN}, as expected, {given}. If so, take each 'transform_matrix' of "
-        f"transforms.json: {_CONVENTIONS[best][2]}"
-    )
-
-
 def _meanings(poses: _Poses) -> dict[str, _Poses]:
     """What the given matrices are as camera to world with OpenGL axes, under each convention."""
     rotations, positions = poses[:, :, :3], poses[:, :, 3:]
     inverse = rotations.transpose(0, 2, 1)
-    found = {_GIVEN: poses}
-    for name, (is_inverted, is_flipped, _) in _CONVENTIONS.items():
+    found = {GIVEN: poses}
+    for name, (is_inverted, is_flipped, _) in CONVENTIONS.items():
         axes, places = (inverse, -(inverse @ positions)) if is_inverted else (rotations, positions)
         found[name] = np.concatenate([axes @ _FLIP if is_flipped else axes, places], axis=-1)
     return found
@@ -248,55 +229,6 @@ def _local_change(image: Image) -> Float[Tensor, "h w"]:
     across = (image[1:-1, 2:] - image[1:-1, :-2]).norm(dim=-1)
     change[1:-1, 1:-1] = across + (image[2:, 1:-1] - image[:-2, 1:-1]).norm(dim=-1)
     return change.nan_to_num(0.0)
-
-
-def parallax_warning(positions: Float[np.ndarray, "N 3"], box: SceneBox) -> str | None:
-    """A warning if all cameras, of a line camera at several rows, stand at one place."""
-    apart = np.linalg.norm(positions - positions[0], axis=1).max()
-    away = np.linalg.norm(np.abs(box.aabb.cpu().numpy() - positions[0]).max(axis=0))
-    if apart > _SMALLEST_BASE * away:
-        return None
-    return (
-        "all training cameras stand at one place: turned about itself, a camera sees nothing of how far away things "
-        "are, so no other place can be rendered from such views. Move it between views; if it was moved, look whether "
-        "each 'transform_matrix' is camera to world: read the other way, all cameras around an object stand at one"
-    )
-
-
-def lens_warning(cameras: Cameras) -> str | None:
-    """A warning if a lens with distortion reaches less than the picture: no direction leads to the rest of it."""
-    shares: dict[tuple[float, ...], float] = {}  # views mostly share a lens
-    lost = []
-    for index in range(len(cameras) if cameras.is_distorted else 0):
-        if not cameras.is_line_camera(index):
-            camera = cameras[index]
-            numbers = torch.cat([camera.focal_px, camera.center_px, camera.distortion], dim=1)
-            lens = (camera.width, camera.height, *numbers[0].tolist())
-            if lens not in shares:
-                shares[lens] = _unreached(camera)
-            lost.append(shares[lens])
-    if max(lost, default=0.0) <= _MOST_UNREACHED:
-        return None
-    views = counted(sum(share > _MOST_UNREACHED for share in lost), "view")
-    return (
-        f"the distortion of {views} folds the picture over: no direction leads to {max(lost):.1%} of its pixels, and "
-        "their rays are wrong. Calibrate the lens anew, with points near the corners too, or mask them"
-    )
-
-
-_MOST_UNREACHED, _PIXELS_ASKED = 0.002, 2_500
-
-
-def _unreached(camera: Cameras) -> float:
-    """Share of pixels that don't come back when what lies on their rays is projected."""
-    camera = camera.shrunk(_PIXELS_ASKED)
-    if not camera.is_distorted:
-        return 0.0
-    rays = camera.image_rays(0)
-    pixels, depths = camera.project(rays.origins + rays.directions, 0)
-    assert rays.pixel_coords is not None
-    comes_back = (depths > 0) & ((pixels - rays.pixel_coords).norm(dim=1) < 1.0)
-    return 1.0 - float(comes_back.float().mean())
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float64
 
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.scenes.folder import CUBE_KEY
+from unmix_plugin.scenes.messages import Message
 from unmix_plugin.scenes.reading.cubes import check_abundances, check_cubes, warn_clipped
 from unmix_plugin.scenes.reading.entries import FrameEntry, Size
 from unmix_plugin.scenes.reading.faults import Faults
@@ -86,8 +87,7 @@ def check_frames(
         unknown = _union(cube.invalid, None if mask is None else ~mask)
         has_valid = cube.num_invalid_pixels < cube.num_pixels
         if has_valid and mask is not None and mask.any() and unknown is not None and unknown.all():
-            message = "the mask leaves only pixels with NaN, infinite or negative values; drop the frame"
-            faults.add(cube.where, message)
+            faults.note(cube.where, Message.MASK_LEAVES_NOTHING)
         foreground = None
         if shown is not None:
             seen = shown[index]
@@ -123,8 +123,7 @@ def _read_operators(
         chosen = range(last + 1) if frame.bands is None else frame.bands
         outside = [band for band in chosen if not 0 <= band <= last]
         if outside:
-            expected = f"expected 0 to {last}, indices into 'wavelengths'"
-            faults.add(frame.where, f"'bands' has {outside[0]}; {expected}")
+            faults.note(frame.where, Message.BAND_OUTSIDE, band=outside[0], last=last)
         operators.append(None if outside else rows[list(chosen)])
     return operators
 
@@ -135,10 +134,9 @@ def _read_responses(path: Path, bands: Bands, where: str, faults: Faults) -> _Op
         sensor = read_sensor(path)
         seen = sensor.seen_by(bands)
     except SpectrumError as error:
-        return faults.add(where, str(error))
+        return faults.note(where, Message.WRONG_RESPONSES, reason=error)
     if seen.notes:
-        found = "; ".join(seen.notes)
-        return faults.add(where, f"{path}: {found}; 'wavelengths' must cover all channels")
+        return faults.note(where, Message.RESPONSES_UNCOVERED, path=path, reason="; ".join(seen.notes))
     columns = [seen.names.index(name) for name in sensor.column_names]
     return np.ascontiguousarray(seen.matrix.T[columns])
 
@@ -166,10 +164,9 @@ def _group_by_sensor(
         index, first_size = known[key]
         if first_size != size:
             found, expected = (f"{wide} x {high}" for high, wide in (size, first_size))
-            faults.add(
-                frame.where, f"has {found} pixels, others of sensor {name!r} {expected}; name it otherwise"
-            )
+            values = {"found": found, "expected": expected, "sensor": name}
+            faults.note(frame.where, Message.SENSOR_OF_OTHER_SIZE, **values)
         elif not np.array_equal(sensors[index].matrix, matrix):
-            faults.add(frame.where, f"has other bands than others of sensor {name!r}; name it otherwise")
+            faults.note(frame.where, Message.SENSOR_OF_OTHER_BANDS, sensor=name)
         indices.append(index)
     return tuple(sensors), tuple(indices)

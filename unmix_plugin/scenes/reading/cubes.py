@@ -21,6 +21,7 @@ from jaxtyping import Bool, Float32
 
 from unmix_plugin.errors import name_some
 from unmix_plugin.scenes.folder import CUBE_KEY
+from unmix_plugin.scenes.messages import Message
 from unmix_plugin.scenes.reading.entries import FrameEntry, Size
 from unmix_plugin.scenes.reading.faults import Faults, sha256_of
 from unmix_plugin.settings import SceneOptions
@@ -83,25 +84,25 @@ def read_array_header(path: Path) -> _ArrayHeader:
         try:
             version = np.lib.format.read_magic(file)
         except ValueError as error:
-            raise UnreadableArrayError("is not a .npy file; write it with numpy.save") from error
+            raise UnreadableArrayError(Message.NO_NPY.sentence()) from error
         if version not in READ_HEADER:
-            raise UnreadableArrayError(f"is a .npy file of version {version}; write it with numpy.save")
+            raise UnreadableArrayError(Message.NPY_VERSION.sentence(version=version))
         try:
             shape, is_fortran, dtype = parse_header(file, version)
         except Exception as error:  # numpy raises SyntaxError, TokenError, ValueError... for a damaged header
-            raise UnreadableArrayError("has a damaged .npy header; write it again") from error
+            raise UnreadableArrayError(Message.NPY_DAMAGED.sentence()) from error
         offset = file.tell()
         found_bytes = path.stat().st_size - offset
     if not all(type(length) is int and length >= 0 for length in shape):
-        raise UnreadableArrayError(f"has the shape {shape} in its .npy header; write it again")
+        raise UnreadableArrayError(Message.NPY_SHAPE.sentence(shape=shape))
     if dtype.hasobject:
-        raise UnreadableArrayError("holds pickled Python objects, which are never loaded: they can run code")
+        raise UnreadableArrayError(Message.NPY_PICKLED.sentence())
     if dtype.kind not in "fiu":
-        raise UnreadableArrayError(f"holds {dtype} values; expected a float or an integer type")
+        raise UnreadableArrayError(Message.NPY_TYPE.sentence(dtype=dtype))
     expected_bytes = prod(shape) * dtype.itemsize
     if found_bytes < expected_bytes:
-        expected = f"{expected_bytes} expected for shape {shape}"
-        raise UnreadableArrayError(f"is cut short: {found_bytes} bytes of values found, {expected}")
+        values = {"found": found_bytes, "expected": expected_bytes, "shape": shape}
+        raise UnreadableArrayError(Message.NPY_CUT.sentence(**values))
     return _ArrayHeader(shape, dtype, offset, is_fortran)
 
 
@@ -264,14 +265,15 @@ def check_cubes(
         elif expected is None and shape is not None:
             expected = shared = shape[:2], f"as {where} has"
         if shape is not None and expected is not None and shape[:2] != expected[0]:
-            wide = f"{shape[1]} x {shape[0]} pixels (width x height)"
-            (height, width), reason = expected
-            faults.add(where, f"the cube has {wide}; expected {width} x {height}, {reason}")
+            (high, wide), reason = expected
+            values = {"width": shape[1], "height": shape[0], "wide": wide, "high": high, "reason": reason}
+            faults.note(where, Message.CUBE_SIZE, **values)
             path = None
         elif shape is not None and operator is not None and shape[2] != len(operator):
             listed = "'wavelengths' lists" if frame.bands is None else "its 'bands' list"
             listed = "its responses have" if "responses_path" in frame.paths else listed
-            faults.add(where, f"the cube has {shape[2]} bands; expected {len(operator)}, as {listed}")
+            values = {"found": shape[2], "expected": len(operator), "reason": listed}
+            faults.note(where, Message.CUBE_BANDS, **values)
         sizes.append(None if expected is None else expected[0])
         sound.append(None if shape is None else path)
     return sizes, _check_values(frames, sound, options, faults)
@@ -301,11 +303,14 @@ def warn_clipped(cubes: Sequence[_CubeValues], value_scale: float | None) -> tup
     clipped = [cube for cube in cubes if cube.share_above_one > _EXCESS_SHARE]
     if value_scale is None or not clipped:
         return ()
-    share, greatest = max(cube.share_above_one for cube in clipped), max(cube.greatest for cube in clipped)
-    found = f"up to {share:.0%} of the values are above 1 after division by the value scale {value_scale:g}"
-    stored_as = f"and count as 1 (up to {greatest:g} as stored)"
-    advice = f"if they are no highlights, give --value-scale {_propose_scale(clipped):g}"
-    return (f"{name_some([cube.where for cube in clipped])}: {found} {stored_as}; {advice}",)
+    warning = Message.CLIPPED.sentence(
+        cubes=name_some([cube.where for cube in clipped]),
+        share=max(cube.share_above_one for cube in clipped),
+        scale=value_scale,
+        greatest=max(cube.greatest for cube in clipped),
+        proposed=_propose_scale(clipped),
+    )
+    return (warning,)
 
 
 def _read_shape(path: Path | None, layout: str, where: str, faults: Faults) -> tuple[int, int, int] | None:
@@ -317,9 +322,9 @@ def _read_shape(path: Path | None, layout: str, where: str, faults: Faults) -> t
     except UnreadableArrayError as error:
         return faults.add(where, str(error))
     except OSError as error:
-        return faults.add(where, f"cannot be opened ({error.strerror})")
+        return faults.note(where, Message.FILE_CLOSED, reason=error.strerror)
     if len(shape) != 3 or 0 in shape:
-        return faults.add(where, f"has shape {shape}; expected {layout}")
+        return faults.note(where, Message.NO_CUBE_SHAPE, shape=shape, expected=layout)
     height, width, depth = shape
     return height, width, depth
 
@@ -334,14 +339,13 @@ def check_abundances(
         if path is None or shape is None:
             continue
         if size is not None and shape[:2] != size:
-            expected = f"{size[1]} x {size[0]} as the cubes have"
-            faults.add(where, f"has {shape[1]} x {shape[0]} pixels (width x height); expected {expected}")
+            values = {"width": shape[1], "height": shape[0], "wide": size[1], "high": size[0]}
+            faults.note(where, Message.ABUNDANCE_SIZE, **values)
         if num_materials is not None and shape[2] != num_materials:
-            expected = f"{num_materials}, one a material"
-            faults.add(where, f"has {shape[2]} abundances a pixel; expected {expected}")
+            faults.note(where, Message.ABUNDANCE_COUNT, found=shape[2], expected=num_materials)
         values = map_array(path)
         if not (values.min() >= -0.01 and values.max() <= 1.01):  # false with any NaN
-            faults.add(where, "has abundances outside [0, 1] or NaN; expected fractions")
+            faults.note(where, Message.ABUNDANCE_RANGE)
 
 
 def _note_invalid(cubes: Sequence[_CubeValues], invalid_pixels: str, faults: Faults) -> None:
@@ -351,11 +355,9 @@ def _note_invalid(cubes: Sequence[_CubeValues], invalid_pixels: str, faults: Fau
         if invalid_pixels == "refuse" and cube.num_invalid_pixels:
             refused.append(cube)
         elif invalid_pixels != "refuse" and cube.num_invalid_pixels == cube.num_pixels:
-            found = "every pixel of the cube has a NaN, infinite or negative value"
-            faults.add(cube.where, f"{found}; drop the frame")
+            faults.note(cube.where, Message.CUBE_ALL_INVALID)
         elif invalid_pixels == "clip" and not cube.is_noise:
-            found = f"the cube has {cube.num_far_negative} values far below 0"
-            faults.add(cube.where, f"{found}, which is not noise; check its dark frame")
+            faults.note(cube.where, Message.CUBE_FAR_NEGATIVE, count=cube.num_far_negative)
     if not refused:
         return
     nan, infinite, negative, invalid, pixels = (
@@ -370,7 +372,8 @@ def _note_invalid(cubes: Sequence[_CubeValues], invalid_pixels: str, faults: Fau
     lowest = f", down to {min(cube.least for cube in refused):.3g}" if negative else ""
     subject = "the cube has" if len(refused) == 1 else "their cubes have"
     for cube in refused:
-        faults.add(cube.where, f"{subject} {found} values in {invalid} of {pixels} pixels{lowest}; {remedy}")
+        values = {"pixels": invalid, "all_pixels": pixels, "lowest": lowest, "remedy": remedy}
+        faults.note(cube.where, Message.CUBE_INVALID, subject=subject, found=found, **values)
 
 
 def _note_integers(cubes: Sequence[_CubeValues], faults: Faults) -> None:
@@ -378,11 +381,9 @@ def _note_integers(cubes: Sequence[_CubeValues], faults: Faults) -> None:
     if not cubes:
         return
     greatest, scale = max(cube.greatest for cube in cubes), _propose_scale(cubes)
-    found = f"the cube holds integers (up to {greatest:g} in this scene)"
     meaning = f" ({_INTEGER_SCALES[scale]})" if scale in _INTEGER_SCALES else ""
-    advice = f"give --value-scale {scale:g}, the number that stands for 1{meaning}"
     for cube in cubes:
-        faults.add(cube.where, f"{found}; {advice}")
+        faults.note(cube.where, Message.CUBE_INTEGER, greatest=greatest, scale=scale, meaning=meaning)
 
 
 def _note_far_off(cubes: Sequence[_CubeValues], scale: float | None, faults: Faults) -> None:
@@ -392,12 +393,11 @@ def _note_far_off(cubes: Sequence[_CubeValues], scale: float | None, faults: Fau
     far = [cube for cube in cubes if cube.share_above_one > most_share or cube.greatest > most]
     if not far:
         return
-    greatest = max(cube.greatest for cube in far)
-    given, advice = "", f"give --value-scale {_propose_scale(far):g}"
-    if scale is None:
-        advice += ", or to 1 to clip highlights at 1"
-    else:
-        given = f" after division by --value-scale {scale:g}"
-    found = f"the cube's values are far outside [0, 1]{given} (up to {greatest:g} as stored in this scene)"
+    values = {
+        "given": "" if scale is None else f" after division by --value-scale {scale:g}",
+        "greatest": max(cube.greatest for cube in far),
+        "scale": _propose_scale(far),
+        "or_clip": ", or to 1 to clip highlights at 1" if scale is None else "",
+    }
     for cube in far:
-        faults.add(cube.where, f"{found}; {advice}")
+        faults.note(cube.where, Message.CUBE_FAR_OFF, **values)

@@ -24,6 +24,7 @@ from unmix_plugin.scenes.folder import (
     unfollowed_keys,
 )
 from unmix_plugin.scenes.frame_cameras import FrameCamera, make_cameras
+from unmix_plugin.scenes.messages import Message
 from unmix_plugin.scenes.placement import Normalisation, Placement, read_placement
 from unmix_plugin.scenes.reading.faults import FILE_NAME, Faults, resolve_path
 from unmix_plugin.spectral.bands import require_nanometres
@@ -105,9 +106,9 @@ def read_entries(root: Path, faults: Faults, needs_cubes: bool = True) -> SceneE
     for where, frame in transforms.frames:
         own = read_frame_keys(frame, where, faults)
         if needs_cubes and frame.get(CUBE_KEY) is None:
-            faults.add(where, f"has no '{CUBE_KEY}'; expected the path of its (H, W, B) .npy cube")
+            faults.note(where, Message.NO_CUBE)
         elif frame.get(CUBE_KEY) is None and frame.get("file_path") is None:
-            faults.add(where, "has no 'file_path'; expected the path of its picture")
+            faults.note(where, Message.NO_PICTURE)
         camera = FrameCamera.read(scene, frame, where, faults)
         bands = None if own.bands is None else tuple(own.bands)
         frames.append(FrameEntry(where, own.paths, camera, own.sensor, bands, own.shot))
@@ -129,22 +130,21 @@ def _read_wavelengths(keys: SceneKeys, faults: Faults) -> Float64[np.ndarray, " 
     values = keys.wavelengths
     if not isinstance(values, list) or not values:
         found = "is absent" if values is None else f"is {describe(values)}"
-        return faults.add(FILE_NAME, f"'wavelengths' {found}; expected a list of the bands' centres in nm")
+        return faults.note(FILE_NAME, Message.NO_WAVELENGTHS, found=found)
     numbers = [read_number(value) or -1.0 for value in values]
     if min(numbers) <= 0:
         band = next(band for band, number in enumerate(numbers) if number <= 0)
-        found = f"'wavelengths' has {describe(values[band])} at band {band}"
-        return faults.add(FILE_NAME, f"{found}; expected a positive number in nm")
+        return faults.note(FILE_NAME, Message.WAVELENGTH_NO_NUMBER, found=describe(values[band]), band=band)
     wavelengths = np.array(numbers, dtype=np.float64)
     drops = np.flatnonzero(np.diff(wavelengths) <= 0.0)
     if drops.size:
-        a, b = wavelengths[drops[0]], wavelengths[drops[0] + 1]
-        message = f"'wavelengths' must increase; got {a:g} nm then {b:g} nm at band {drops[0] + 1}"
-        return faults.add(FILE_NAME, message + "; sort the bands of wavelengths and cubes alike")
+        before, after = wavelengths[drops[0] : drops[0] + 2]
+        values = {"before": before, "after": after, "band": drops[0] + 1}
+        return faults.note(FILE_NAME, Message.WAVELENGTHS_FALL, **values)
     try:
         require_nanometres(wavelengths)
     except SpectrumError as error:
-        return faults.add(FILE_NAME, f"'wavelengths': {error}")
+        return faults.note(FILE_NAME, Message.WAVELENGTHS_NO_NM, reason=error)
     return wavelengths
 
 
@@ -155,7 +155,7 @@ def _read_materials(keys: SceneKeys, faults: Faults) -> tuple[str, ...] | None:
     names = values if isinstance(values, list) else [None]
     are_names = names and all(isinstance(v, str) and v.strip() and v.isprintable() for v in names)
     if not are_names or len(set(values)) != len(values):
-        return faults.add(FILE_NAME, f"'materials' is {describe(values)}; expected a list of different names")
+        return faults.note(FILE_NAME, Message.NO_MATERIALS, found=describe(values))
     return tuple(values)
 
 
@@ -167,8 +167,7 @@ def read_widths(keys: SceneKeys, faults: Faults) -> Float64[np.ndarray, " B"] | 
     known = [0.0 if value is None else value for value in values] if isinstance(values, list) else None
     widths = read_numbers(known, len(centers))
     if widths is None or (widths < 0).any():
-        expected = "a width in nm above 0 for each of the wavelengths (0 or null where it is unknown)"
-        return faults.add(FILE_NAME, f"'fwhm' must have {expected}, or be left out")
+        return faults.note(FILE_NAME, Message.WRONG_WIDTHS)
     return np.where(widths == 0, np.nan, widths)
 
 
@@ -196,8 +195,7 @@ def locate_files(root: Path, entry: SceneEntry, allow_outside: bool, faults: Fau
         if CUBE_KEY in files:
             first = owner.setdefault(files[CUBE_KEY].resolve(), frame.where)
             if first != frame.where:
-                text = frame.paths[CUBE_KEY]
-                faults.add(frame.where, f"is a duplicate: its cube {text!r} is that of {first} too; drop one")
+                faults.note(frame.where, Message.CUBE_TWICE, path=frame.paths[CUBE_KEY], other=first)
         frames.append(replace(frame, files=files))
     return replace(entry, frames=tuple(frames))
 

@@ -10,9 +10,11 @@ import unicodedata
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 from urllib.parse import unquote
 
 from unmix_plugin.errors import SceneError, UnmixError, name_some
+from unmix_plugin.scenes.messages import Message
 
 FILE_NAME = "transforms.json"
 MAX_LISTED = 20
@@ -34,7 +36,7 @@ class Faults:
         return str(self._root) if self._root.suffix == ".json" else FILE_NAME
 
     def add(self, where: str, message: str) -> None:
-        """Note a fault; a reader returns this None in place of a value.
+        """Note a fault that has no code.
 
         Args:
             where: File, frame or key that has it.
@@ -44,6 +46,10 @@ class Faults:
         places = self._places.setdefault(message, [])
         if where not in places:
             places.append(where)
+
+    def note(self, where: str, message: Message, /, **values: Any) -> None:
+        """Note a fault by its code; a reader returns this None in place of a value."""
+        self.add(where, message.sentence(**values))
 
     def raise_if_any(self, kind: type[UnmixError] = SceneError) -> None:
         """End here if anything is wrong. Raises an error of this kind: faults were noted; its message lists them."""
@@ -140,7 +146,7 @@ def resolve_path(
         inside = path.resolve().is_relative_to(root.resolve()) and not Path(text).is_absolute()
         is_file = path.is_file()
     except (OSError, RuntimeError, ValueError) as error:  # a name too long, a loop of links, a zero byte
-        return faults.add(where, f"{text!r} cannot be followed ({type(error).__name__})")
+        return faults.note(where, Message.PATH_UNFOLLOWED, path=text, reason=type(error).__name__)
     if is_file and (inside or allow_outside):
         return path
     if found := find_named(root, text, least_parts):
@@ -148,9 +154,8 @@ def resolve_path(
     if not inside and not allow_outside:
         or_allow = ", or allow it with --allow-outside-paths if you trust this scene"
         advice = f"copy the file into it{'' if allow_outside is None else or_allow}"
-        return faults.add(where, f"{text!r} leaves the scene folder; {advice}")
-    state = "is not a plain file" if path.exists() else "is missing"
-    return faults.add(where, f"{text!r} {state}; add the file or drop the entry")
+        return faults.note(where, Message.PATH_OUTSIDE, path=text, advice=advice)
+    return faults.note(where, Message.PATH_NO_FILE if path.exists() else Message.PATH_MISSING, path=text)
 
 
 def sha256_of(path: Path) -> str:

@@ -14,6 +14,7 @@ from jaxtyping import Bool, UInt8
 
 from unmix_plugin.errors import SceneError
 from unmix_plugin.limits import allow_decoded
+from unmix_plugin.scenes.messages import Message
 from unmix_plugin.scenes.reading.entries import FrameEntry, Size
 from unmix_plugin.scenes.reading.faults import Faults
 
@@ -40,7 +41,9 @@ def read_colour(path: Path, size: Size | None) -> UInt8[np.ndarray, "H W C"]:
 
     def convert(image: Image.Image) -> np.ndarray:
         if image.mode not in _COLOUR_MODES:
-            raise UnreadableImageError(f"is a picture of mode {image.mode}; expected 8-bit RGB or RGBA")
+            raise UnreadableImageError(
+                Message.PICTURE_MODE.sentence(mode=image.mode, expected="8-bit RGB or RGBA")
+            )
         has_clear_colour = "transparency" in image.info  # tRNS of a PNG: a colour, or entries of the palette
         return np.asarray(image.convert("RGBA" if has_clear_colour else _COLOUR_MODES[image.mode]))
 
@@ -53,7 +56,9 @@ def read_labels(path: Path, size: Size) -> UInt8[np.ndarray, "H W"]:
 
     def convert(image: Image.Image) -> np.ndarray:
         if image.mode not in ("L", "P"):
-            raise UnreadableImageError(f"is a picture of mode {image.mode}; expected one 8-bit channel")
+            raise UnreadableImageError(
+                Message.PICTURE_MODE.sentence(mode=image.mode, expected="one 8-bit channel")
+            )
         return np.asarray(image)
 
     return read_picture(path, size, convert)
@@ -79,8 +84,7 @@ def white_of(image: Image.Image) -> Bool[np.ndarray, "H W"]:
     levels = np.unique(grey)
     if len(levels[levels > 0]) > 1:
         raise UnreadableImageError(
-            f"is a mask with {len(levels)} dark greys up to {brightest}; expected 0 and {top} (black and white), or 0 "
-            "and 1"
+            Message.MASK_GREYS.sentence(greys=len(levels), brightest=brightest, white=top)
         )
     return grey > 0
 
@@ -112,15 +116,16 @@ def read_picture(
             if size is None:
                 allow_decoded(path, image.height * image.width * 16, SceneError)  # as float32
             elif (image.height, image.width) != size:
-                found = f"the picture has {image.width} x {image.height} pixels (width x height)"
-                raise UnreadableImageError(f"{found}; expected {size[1]} x {size[0]} as the cubes have")
+                values = {"width": image.width, "height": image.height, "wide": size[1], "high": size[0]}
+                raise UnreadableImageError(Message.PICTURE_SIZE.sentence(**values))
             return convert(image)
     except (UnreadableImageError, SceneError):
         raise
     # pillow reports damage as OSError, SyntaxError, ValueError, EOFError or a bomb error, by format
     except Exception as error:
+        reason = f"{type(error).__name__}: {error}"
         raise UnreadableImageError(
-            f"cannot be read as a picture: {', '.join(formats)} ({type(error).__name__}: {error})"
+            Message.NO_PICTURE_FILE.sentence(formats=", ".join(formats), reason=reason)
         ) from error
 
 
@@ -150,8 +155,7 @@ def check_colours(
     if transparent is None:
         return None
     for frame in without:
-        message = f"has no picture with alpha, while {transparent.where} is transparent in places"
-        faults.add(frame.name_of("file_path"), f"{message}; give alpha to all or to none")
+        faults.note(frame.name_of("file_path"), Message.NO_ALPHA, other=transparent.where)
     return seen
 
 
@@ -161,7 +165,7 @@ def check_masks(frames: Sequence[FrameEntry], sizes: Sequence[Size | None], faul
     for frame, size in zip(frames, sizes, strict=True):
         mask = _checked(frame, "mask_path", read_mask, size, faults)
         if mask is not None and not mask.any():
-            faults.add(frame.name_of("mask_path"), "the mask is black everywhere; drop the frame")
+            faults.note(frame.name_of("mask_path"), Message.MASK_BLACK)
         masks.append(mask)
     return masks
 
@@ -174,8 +178,8 @@ def check_labels(
         labels = _checked(frame, "seg_file_path", read_labels, size, faults)
         greatest = 0 if labels is None else int(labels.max(where=labels != UNLABELLED, initial=0))
         if num_materials is not None and greatest >= num_materials:
-            expected = f"expected 0 to {num_materials - 1} for the materials, or {UNLABELLED}"
-            faults.add(frame.name_of("seg_file_path"), f"has label {greatest}; {expected}")
+            values = {"label": greatest, "last": num_materials - 1}
+            faults.note(frame.name_of("seg_file_path"), Message.LABEL_OUTSIDE, **values)
 
 
 def _checked(

@@ -15,6 +15,7 @@ from jaxtyping import Float64
 from unmix_plugin.engine.runs.atomic_files import NOT_PORTABLE, safe_name
 from unmix_plugin.errors import SceneError, SpectrumError
 from unmix_plugin.scenes.folder import CUBE_KEY
+from unmix_plugin.scenes.messages import Message
 from unmix_plugin.scenes.reading.checks import CheckedFiles, check_frames
 from unmix_plugin.scenes.reading.entries import SceneEntry, at_sizes, locate_files, read_entries
 from unmix_plugin.scenes.reading.faults import FILE_NAME, Faults, resolve_path, sha256_of
@@ -26,9 +27,6 @@ from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import illuminant_power
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, read_spectra
 
-_NOTHING_TO_SEE = (
-    "the training views show nothing but a plain backdrop or sky: there is no shape that could be learnt"
-)
 _MEASURED_KEYS = (CUBE_KEY, "file_path", "mask_path", "responses_path")
 """Files of a frame that a training reads; the others are the truth, for evaluation only."""
 
@@ -47,9 +45,7 @@ def load_scene(root: Path, options: SceneOptions | None = None) -> Scene:
     options, faults = options or SceneOptions(), Faults(root)
     scale = options.value_scale
     if scale is not None and not 1e-30 <= scale <= 1e30:  # float32 divides by these
-        raise SceneError(
-            f"{root}: --value-scale: is {scale:g}; expected a positive number, what stands for 1"
-        )
+        raise SceneError(f"{root}: {Message.VALUE_SCALE.sentence(scale=scale)}")
     entry = read_entries(root, faults)
     if scale is None:
         options = replace(options, value_scale=entry.keys.value_scale)
@@ -66,17 +62,13 @@ def load_scene(root: Path, options: SceneOptions | None = None) -> Scene:
         is_seen = np.any([checked.sensors[index].seen_bands for index in sorted(used)], axis=0)
         if not is_seen.all():
             unseen = ", ".join(f"{nm:g}" for nm in entry.wavelengths_nm[~is_seen])
-            faults.add("'wavelengths'", f"no training frame sees the bands at {unseen} nm; leave them out")
+            faults.note("'wavelengths'", Message.UNSEEN_BANDS, bands=unseen)
             if far_off is not None:
                 faults.add(FILE_NAME, far_off)
         split = replace(split, train=train)
         entry = replace(entry, warnings=(*entry.warnings, *checked.warnings, *([far_off] if far_off else [])))
     if options.world == "unbounded" and checked is not None and checked.has_alpha:
-        faults.add(
-            "world",
-            "is unbounded, but pictures have alpha, and behind what is transparent there is nothing; expected bounded "
-            "or auto, or pictures without alpha",
-        )
+        faults.note("world", Message.WORLD_WITH_ALPHA)
     faults.raise_if_any()
     assert checked is not None
     return _assemble(root, entry, checked, truth, split, options)
@@ -107,7 +99,7 @@ def _read_truth(root: Path, entry: SceneEntry, options: SceneOptions, faults: Fa
         try:
             illuminant = illuminant_power(light_path, Bands(bands)) / (entry.keys.reflectance_of_1 or 1.0)
         except SpectrumError as error:
-            faults.add("'illuminant_path'", str(error))
+            faults.note("'illuminant_path'", Message.WRONG_LIGHT, reason=error)
     if materials_path is not None and bands is not None:
         table = read_endmembers(materials_path, bands, names, faults)
         names, endmembers = (names, None) if table is None else (table.names, table.spectra)
@@ -121,12 +113,12 @@ def read_endmembers(
     try:
         table = read_spectra(path).resampled(Bands(wavelengths_nm))
     except SpectrumError as error:
-        return faults.add("'endmembers_path'", str(error))
+        return faults.note("'endmembers_path'", Message.WRONG_ENDMEMBERS, reason=error)
     if materials is None:
         return table
     if sorted(materials) != sorted(table.names):
-        found = f"{path} names {list(table.names)}"
-        return faults.add("'endmembers_path'", f"{found}; expected the 'materials' {list(materials)}")
+        values = {"path": path, "found": list(table.names), "expected": list(materials)}
+        return faults.note("'endmembers_path'", Message.OTHER_MATERIALS, **values)
     order = [table.names.index(name) for name in materials]
     return SpectraTable(table.bands, materials, table.spectra[order])
 
@@ -137,10 +129,10 @@ def _assemble(
     space = find_model_space(root, entry, checked, split.train, options)
     before, fwhm_nm, warnings = space.before_backdrop, entry.fwhm_nm, entry.warnings
     if fwhm_nm is not None and (unknown := int(np.isnan(fwhm_nm).sum())):
-        found = f"'fwhm' has 0 or null for {unknown} of {len(fwhm_nm)} bands"
-        fwhm_nm, warnings = None, (*warnings, f"{found}: the widths of all count as unknown")
+        warning = Message.UNKNOWN_WIDTHS.sentence(unknown=unknown, bands=len(fwhm_nm))
+        fwhm_nm, warnings = None, (*warnings, warning)
     if before is not None and not before.shows_matter:
-        before, warnings = None, (*warnings, _NOTHING_TO_SEE)
+        before, warnings = None, (*warnings, Message.NOTHING_TO_SEE.sentence())
     known = {frame.cube: frame.sha256 for frame in checked.frames}
     files = [(key, path) for frame in entry.frames for key, path in frame.files.items()]
     inputs = [path for key, path in files if key in _MEASURED_KEYS] + [root / FILE_NAME, truth.light_path]

@@ -15,13 +15,14 @@ from unmix_plugin.engine.geometry.camera_paths import meeting_point
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes.backdrops import BeforeBackdrop, find_before_backdrop
-from unmix_plugin.scenes.doctor import check_masks, contradicted_share
+from unmix_plugin.scenes.doctor import check_masks, check_poses, contradicted_share
 from unmix_plugin.scenes.folder import CUBE_KEY
 from unmix_plugin.scenes.geometry.bounds import find_bounds
 from unmix_plugin.scenes.geometry.carving import MOST_CONTRADICTED
 from unmix_plugin.scenes.geometry.matched_points import find_matched_points
-from unmix_plugin.scenes.geometry.view_agreement import compare_conventions, describe, find_world_evidence
+from unmix_plugin.scenes.geometry.view_agreement import compare_conventions, find_world_evidence
 from unmix_plugin.scenes.geometry.views import Views, commonest
+from unmix_plugin.scenes.messages import Message
 from unmix_plugin.scenes.placement import Normalisation
 from unmix_plugin.scenes.reading.checks import CheckedFiles
 from unmix_plugin.scenes.reading.cubes import read_cube
@@ -54,11 +55,8 @@ def without_far_off(entry: SceneEntry, train: tuple[int, ...]) -> tuple[tuple[in
     if not is_off.any():
         return train, None
     names = ", ".join(entry.frames[train[row]].files[CUBE_KEY].name for row in np.flatnonzero(is_off))
-    said = (
-        f"left out of training: {names}, {distances.max() / usual:.0f} times as far from the middle of the cameras as "
-        "nearly all others: its pose must be wrong"
-    )
-    return tuple(view for view, off in zip(train, is_off, strict=True) if not off), said
+    warning = Message.FAR_OFF_POSE.sentence(views=names, times=distances.max() / usual)
+    return tuple(view for view, off in zip(train, is_off, strict=True) if not off), warning
 
 
 @dataclass(frozen=True)
@@ -145,8 +143,8 @@ def find_model_space(
     try:
         box = box or find_bounds(cameras, foreground, points)
     except SceneError as error:
-        hint = describe(compare_conventions(poses[alike], compared))
-        raise SceneError(f"{root}: {error}" + (f"\n{hint}" if hint else "")) from error
+        hint = check_poses(compare_conventions(poses[alike], compared))
+        raise SceneError(f"{root}: {error}" + ("" if hint is None else f"\n{hint.sentence()}")) from error
     is_unbounded, reason = options.world == "unbounded", None
     decisions = [] if backdrop.decision is None else [backdrop.decision]
     if options.world == "auto" and not has_masks and not (points and points.are_equally_far):

@@ -12,6 +12,7 @@ from pathlib import PurePosixPath
 from typing import Literal
 
 from unmix_plugin.scenes.folder import CUBE_KEY
+from unmix_plugin.scenes.messages import Message
 from unmix_plugin.scenes.reading.entries import SceneEntry
 from unmix_plugin.scenes.reading.faults import FILE_NAME, Faults
 
@@ -35,8 +36,7 @@ def split_frames(
 ) -> Split:
     """Split the frames; notes a fault where training or evaluation is left without a frame."""
     if method == "lists" and not entry.split_lists:
-        missing = "has no train_filenames, val_filenames or test_filenames"
-        faults.add(FILE_NAME, f"{missing}; --eval-split lists needs them")
+        faults.note(FILE_NAME, Message.NO_SPLIT_LISTS)
         return Split((), ())
     if method == "lists" or (method == "auto" and entry.split_lists):
         split = _by_lists(entry, faults)
@@ -46,10 +46,9 @@ def split_frames(
         split = _by_interval(entry, interval, faults)
     how = "split chosen by itself" if method == "auto" else f"split by {method}"
     if entry.frames and not split.train:
-        faults.add(FILE_NAME, f"no frame is left to train on ({how}); name some in 'train_filenames'")
+        faults.note(FILE_NAME, Message.NONE_TO_TRAIN, how=how)
     if entry.frames and not split.evaluation:
-        advice = "name some in 'test_filenames' or use --eval-split interval"
-        faults.add(FILE_NAME, f"no frame is left to evaluate ({how}); {advice}")
+        faults.note(FILE_NAME, Message.NONE_TO_EVALUATE, how=how)
     return split
 
 
@@ -59,8 +58,7 @@ def _by_lists(entry: SceneEntry, faults: Faults) -> Split:
     ]
     train, evaluation = split_by_lists(names, entry.split_lists, faults)
     for index in sorted(train & evaluation):
-        message = "is listed for training and for evaluation; a frame trained on cannot judge the result"
-        faults.add(entry.frames[index].where, message)
+        faults.note(entry.frames[index].where, Message.IN_BOTH_SPLITS)
     return Split(tuple(sorted(train)), tuple(sorted(evaluation)))
 
 
@@ -81,7 +79,7 @@ def split_by_lists(
     for name, paths in lists.items():
         for path in paths:
             if _plain(path) not in owners:
-                faults.add(f"'{name}_filenames'", f"lists {path!r}, which is the file_path of no frame")
+                faults.note(f"'{name}_filenames'", Message.NOT_A_FRAME, path=path)
         chosen[name] = {index for path in paths for index in owners.get(_plain(path), ())}
     everything = set(range(len(names)))
     train = chosen.get("train", everything - chosen.get("val", set()) - chosen.get("test", set()))
@@ -115,8 +113,7 @@ def _by_name(entry: SceneEntry, faults: Faults) -> Split:
     for index, frame in enumerate(entry.frames):
         name = _name_split(frame.paths)
         if name is None:
-            message = "neither its folder nor its name starts with train, eval, val or test"
-            faults.add(frame.where, f"{message}, which --eval-split filename needs")
+            faults.note(frame.where, Message.NO_SPLIT_NAME)
         else:
             members.setdefault(name, []).append(index)
     evaluation = members.get("test") or sorted(members.get("eval", []) + members.get("val", []))
@@ -126,7 +123,7 @@ def _by_name(entry: SceneEntry, faults: Faults) -> Split:
 def _by_interval(entry: SceneEntry, interval: int, faults: Faults) -> Split:
     """Every n-th shot evaluates; the frames that a rig took together stay together, they show the same."""
     if interval < 2:
-        faults.add("--eval-interval", f"is {interval}; expected 2 or more: frames are to be left to train on")
+        faults.note("--eval-interval", Message.EVAL_INTERVAL, interval=interval)
         return Split((), ())
     numbers: dict[str | int, int] = {}
     shots = [
