@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
+from tests.captures.file_factory import present
 from tests.scenes.scene_factory import look_at
 from unmix_plugin.captures.checks import SeenView, _overlap, check_views
 from unmix_plugin.captures.poses.lens import Lens
@@ -65,6 +66,7 @@ FAULTS = {
     "blur": (lambda folder: recorded(folder, view_0={"detail": 0.4}), BLUR),
     "saturated": (lambda folder: recorded(folder, view_0={"saturated_pixels": 2000}), "view_0"),
     "missing": (lambda folder: recorded(folder, view_1={"missing_pixels": 2000}), "view_1"),
+    "a lens that folds": (lambda folder: folded(folder), "the distortion of 20 views folds the picture over"),
     "a wall in parts": (lambda folder: with_a_wall(folder), "contradict each other"),
     "empty": (lambda folder: recorded(folder, view_2={"matter_share": 0.0}), "view_2"),
 }
@@ -74,6 +76,15 @@ def recorded(folder, **facts: dict[str, float]):
     """Good views whose records say something else."""
     views = _views(folder, ring_of(20))
     return [replace(view, record=record_of(view.name, **facts.get(view.name, {}))) for view in views]
+
+
+def folded(folder):
+    """Good views that are said to be of a lens that does not reach their corners."""
+    views = []
+    for view in _views(folder, ring_of(20)):
+        lens = replace(present(view.camera.lens), distortion=(-0.6, 0.0, 0.0, 0.0))
+        views.append(replace(view, camera=replace(view.camera, lens=lens)))
+    return views
 
 
 def with_a_wall(folder):

@@ -26,7 +26,7 @@ from unmix_plugin.engine.geometry.camera_paths import meeting_point
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.sampling import evenly_spaced
 from unmix_plugin.errors import counted, name_some
-from unmix_plugin.scenes.doctor import check_masks, contradicted_share
+from unmix_plugin.scenes.doctor import check_lenses, check_masks, contradicted_share
 from unmix_plugin.spectral.colour.srgb import decode_srgb
 
 _FEW_VIEWS = 15
@@ -133,9 +133,29 @@ def check_views(views: Sequence[SeenView], points: _Points | None, findings: lis
             f"only {len(views)} views: expect holes and fog; {_FEW_VIEWS} or more all around serve better"
         )
     _pixels(views, findings)
+    if (folding := check_lenses(_cameras(views, [1.0] * len(views)))) is not None:
+        findings.append(folding.sentence())
     return [
         check(views, points, findings) for check in (_ring, _overlap, _blur, _exposure, _moving_light, _masks)
     ]
+
+
+def _cameras(views: Sequence[SeenView], scales: Sequence[float]) -> Cameras:
+    """Their cameras, of pictures scaled by these factors."""
+    import torch
+
+    poses, numbers, sizes = [], [], []
+    for view, scale in zip(views, scales, strict=True):
+        lens = view.camera.lens
+        assert lens is not None
+        size = (max(1, round(scale * lens.width)), max(1, round(scale * lens.height)))
+        shrunk = np.array(size) / (lens.width, lens.height)
+        focal, center = np.array(lens.focal_px) * shrunk, np.array(lens.center_px) * shrunk
+        numbers.append([*focal, *center, *lens.distortion, *lens.higher_radial])
+        poses.append(view.camera.camera_to_world)
+        sizes.append(size)
+    focal, center, distortion = torch.tensor(np.array(numbers), dtype=torch.float32).split((2, 2, 6), dim=1)
+    return Cameras.of_sizes(torch.from_numpy(np.stack(poses)).float(), focal, center, distortion, sizes)
 
 
 def angles_between(views: Sequence[SeenView]) -> Float64[np.ndarray, "N N"]:
@@ -344,27 +364,25 @@ _LONGEST_MASK_PX, _MOST_MASKS = 160, 60
 def _masks(views: Sequence[SeenView], _: _Points | None, findings: list[str]) -> str:
     """Whether what masks show is there for the other views: a wall that is cut out as backdrop in some views and not
     in others is not."""
-    import torch
     from PIL import Image
 
     some = [views[index] for index in evenly_spaced(len(views), _MOST_MASKS)]
-    lenses = [view.camera.lens for view in some if view.camera.lens is not None]
     if len(some) < _LEAST_VIEWS or all(view.record.matter_share == 1.0 for view in some):
         return "masks are not compared: there are too few views, or none has a mask"
-    shown, numbers, sizes = [], [], []
-    for view, lens in zip(some, lenses, strict=True):
+    scales = [
+        min(1.0, _LONGEST_MASK_PX / max(lens.width, lens.height))
+        for lens in (view.camera.lens for view in some)
+        if lens is not None
+    ]
+    cameras = _cameras(some, scales)
+    shown = []
+    for index, view in enumerate(some):
         with Image.open(view.picture) as picture:
-            scale = min(1.0, _LONGEST_MASK_PX / max(picture.size))
-            size = (max(1, round(scale * picture.width)), max(1, round(scale * picture.height)))
-            opacity = picture.convert("RGBA").getchannel("A").resize(size, Image.Resampling.BOX)
+            opacity = (
+                picture.convert("RGBA").getchannel("A").resize(cameras.size(index), Image.Resampling.BOX)
+            )
         shown.append(np.asarray(opacity) > 127)
-        shrunk = np.array(size) / (lens.width, lens.height)
-        center = np.array(lens.center_px) * shrunk
-        numbers.append([*(np.array(lens.focal_px) * shrunk), *center, *lens.distortion, *lens.higher_radial])
-        sizes.append(size)
-    poses = torch.from_numpy(np.stack([view.camera.camera_to_world for view in some])).float()
-    focal, center, distortion = torch.tensor(np.array(numbers), dtype=torch.float32).split((2, 2, 6), dim=1)
-    share = contradicted_share(Cameras.of_sizes(poses, focal, center, distortion, sizes), shown)[1]
+    share = contradicted_share(cameras, shown)[1]
     if (found := check_masks(share)) is not None:
         findings.append(
             found.sentence(
