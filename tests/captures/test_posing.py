@@ -19,6 +19,7 @@ from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.captures.posing import _complete_rigs, _place_poses, pose_views
 from unmix_plugin.captures.process import _refuse_late
+from unmix_plugin.captures.report import Code, Kind, sentences
 from unmix_plugin.captures.writing.scene_files import _write_points
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.scenes.reading.loader import load_scene
@@ -29,7 +30,7 @@ FAR = np.array([500_123.0, 5_400_321.0, 300.0])
 @pytest.mark.parametrize("is_flight", [False, True])
 def test_a_ring_stands_upright_around_the_origin_whatever_its_world_was_and_what_took_it(is_flight):
     placed, _placement, notes = _place_poses(elsewhere(ring_set(12)), is_flight=is_flight)
-    assert "up is square to the cameras' horizontal axes" in notes
+    assert Code.UP_BY_AXES in {note.code for note in notes}
     stacked = np.stack([camera.camera_to_world for camera in placed.cameras.values()])
     np.testing.assert_allclose(np.linalg.norm(stacked[:, :, 3], axis=1), 1, atol=1e-9)
     np.testing.assert_allclose(stacked[:, 2, 0], 0, atol=1e-9)  # horizontal axes lie flat
@@ -42,10 +43,10 @@ def test_a_known_up_axis_is_kept_and_cameras_in_parallel_have_their_points_in_th
     points = np.array([[1.0, 2.0, -3.0], [2.0, 2.0, -3.0], [3.0, 2.0, -3.0]])
     _, placement, notes = _place_poses(ring_set(up=np.array([0.0, 0.0, 1.0])))
     np.testing.assert_array_equal(placement.rotation, np.eye(3))
-    assert "up is the source's" in notes
+    assert Code.UP_OF_SOURCE in {note.code for note in notes}
     _, placement, notes = _place_poses(replace(in_a_row(), points=points))
     np.testing.assert_allclose(placement.to_source(np.zeros(3)), [2, 2, -3])
-    assert "up is the mean of the cameras' up vectors" in notes
+    assert Code.UP_BY_MEAN in {note.code for note in notes}
 
 
 def test_land_lies_level_below_the_cameras_of_a_flight():
@@ -56,7 +57,7 @@ def test_land_lies_level_below_the_cameras_of_a_flight():
     land = present(placed.points)
     assert np.ptp(land[:, 2]) < 0.1 * np.ptp(land[:, 0])
     assert all(camera.camera_to_world[2, 3] > 0.5 for camera in placed.cameras.values())
-    assert any("up is against where the cameras look" in note for note in notes)
+    assert Code.UP_AGAINST_FLIGHT in {note.code for note in notes}
     np.testing.assert_allclose(placement.to_source(np.zeros(3)), np.median(points, axis=0), atol=1e-9)
 
 
@@ -121,8 +122,10 @@ CUT = "given for 640 x 480 pixels, its file has 400 x 300: taken as scaled. If i
 def test_lenses_that_were_scaled_to_their_pictures_are_said(width, height, note, finding):
     views = [CaptureView(f"view_{index}", cube_of(height, width)) for index in range(6)]
     posed = pose_views(views, ring_set())
-    assert [text for text in posed.notes if "scaled" in text] == [note.format(width, height)] * bool(note)
-    assert [finding in text for text in posed.findings] == [True] * bool(finding)
+    assert [text for text in sentences(posed.remarks, Kind.DONE) if "scaled" in text] == [
+        note.format(width, height)
+    ] * bool(note)
+    assert [finding in text for text in sentences(posed.remarks, Kind.WRONG)] == [True] * bool(finding)
 
 
 def rig_view(release: str, sensor: str, angles: str | None = None) -> CaptureView:
@@ -148,7 +151,7 @@ def test_rotations_in_the_files_turn_a_lens_against_another():
         np.testing.assert_allclose(found[:, :3], expected, atol=1e-12)
         np.testing.assert_allclose(found[:, 3], base[:, 3], atol=1e-12)
         assert completed[f"r1{sensor}"].lens == SMALL_LENS
-    assert all("turned as the files say" in note for note in notes)
+    assert {note.code for note in notes} == {Code.RIG_AS_FILES_SAY}
 
 
 def test_offsets_and_lenses_that_were_found_go_before_those_in_the_files():
@@ -163,18 +166,19 @@ def test_offsets_and_lenses_that_were_found_go_before_those_in_the_files():
     completed, (note,) = _complete_rigs(views, posed)
     np.testing.assert_allclose(completed["r3b"].camera_to_world, moved["r3"][:3], atol=1e-12)
     assert completed["r3b"].lens == lens
-    assert note.startswith("1 view of lens b got the pose of another lens of their release, moved as in")
+    assert (note.code, note.values["lens"]) == (Code.RIG_AS_OTHER_RELEASES, "b")
 
 
 def test_views_without_any_help_are_left_out_and_said_and_those_of_no_release_left_alone():
     views = [rig_view("r1", "a"), rig_view("r1", "b"), *(rig_view("r2", x, ANGLES[x]) for x in "ab")]
     completed, notes = _complete_rigs(views, {"r1a": turned_camera(1)})
     assert set(completed) == {"r1a"}
-    assert any("1 view of lens b left out: there is no pose, and nothing says" in note for note in notes)
-    assert sum("no lens of their release has a pose" in note for note in notes) == 2
+    codes = [(note.code, note.values["lens"]) for note in notes]
+    assert (Code.RIG_OFFSET_UNKNOWN, "b") in codes
+    assert [code for code, _ in codes].count(Code.RIG_WITHOUT_POSE) == 2
     single = [replace(views[0], name=name, sensor="", release="") for name in ("one", "two")]
     completed, notes = _complete_rigs(single, {"one": turned_camera(1)})
-    assert (set(completed), notes) == ({"one"}, ())
+    assert (set(completed), notes) == ({"one"}, [])
 
 
 def test_a_lens_that_pixels_would_be_brought_into_is_refused_once_they_are_written():

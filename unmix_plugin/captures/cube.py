@@ -474,6 +474,8 @@ class Capture:
     """What may make values, wavelengths or geometry wrong, one sentence each: reports begin with it."""
     unreadable: tuple[tuple[str, str], ...] = ()
     """Names of views whose files can't be opened, and why."""
+    no_poses: str = ""
+    """Why the layout has no poses that can be used, for people."""
 
     @property
     def names(self) -> list[str]:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path, PurePosixPath
 
 from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet
+from unmix_plugin.captures.report import Code, Remark
 from unmix_plugin.errors import CaptureError, counted, name_some
 from unmix_plugin.formats.files import NOT_PLAIN, safe_name
 from unmix_plugin.scenes.reading.faults import find_named
@@ -99,12 +100,11 @@ class FoundFiles:
 BY_ORDER = "#"
 """Names of cameras whose source gives none begin with it; they belong, in their order, to views in the order of names,
 sorted as texts as LLFF does."""
-_IN_ORDER = "by their order, as the poses have no names"
 
 
 def match_poses(
     poses: PoseSet, views: Sequence[tuple[str, Sequence[str | Path]]]
-) -> tuple[dict[str, PosedCamera], list[str], list[str]]:
+) -> tuple[dict[str, PosedCamera], list[Remark]]:
     """Find the camera of each view.
 
     Names are compared whole, then as folder and name, file name, and name without suffix, each only where it is unique
@@ -113,17 +113,21 @@ def match_poses(
     Args:
         views: Name and files of each view; the files as paths, of which the trailing parts count.
     Returns:
-        Cameras by the name of the view, without views that have none; how they were matched and what is odd, one
-        sentence each; and warnings of views that may have the poses of others.
+        Cameras by the name of the view, without views that have none; how they were matched, what is odd, and whether
+        views may have the poses of others.
     Raises:
         CaptureError: no view has a pose.
     """
     owners = {name: [name, *camera.other_names] for name, camera in poses.cameras.items()}
     wanted = {name: [name, *(str(file) for file in files)] for name, files in views}
-    if all(name.startswith(BY_ORDER) for name in owners):
+    is_by_order = all(name.startswith(BY_ORDER) for name in owners)
+    if is_by_order:
         if len(owners) != len(wanted):
             raise CaptureError(f"{len(owners)} poses without names and {len(wanted)} views; expected as many")
-        found, how = dict(zip(sorted(wanted), owners, strict=True)), _IN_ORDER
+        found, how = (
+            dict(zip(sorted(wanted), owners, strict=True)),
+            "by their order, as the poses have no names",
+        )
     else:
         found, how = _by_names(owners, wanted), "by name"
     if not found:
@@ -141,25 +145,22 @@ def match_poses(
     cameras_of, views_of = _owners_of(owners, _stem), _owners_of(wanted, _stem)
     several = {stem for stem in views_of if len(views_of[stem]) + len(cameras_of.get(stem, ())) > 2}
     shared = [view for view in unposed if several & cameras_of.keys() & set(map(_stem, wanted[view]))]
-    notes = [f"{len(found)} of {len(wanted)} views were matched {how}"]
-    if how == _IN_ORDER and (ordered := sorted(wanted)) != sorted(wanted, key=natural_order):
-        notes.append(
-            f"names were sorted as texts: {', '.join(ordered[:3])}; if poses go by numbers, give these leading zeros"
-        )
+    remarks = [Remark.of(Code.POSES_MATCHED, matched=len(found), views=len(wanted), how=how)]
+    if is_by_order and (ordered := sorted(wanted)) != sorted(wanted, key=natural_order):
+        remarks.append(Remark.of(Code.NAMES_AS_TEXTS, first=", ".join(ordered[:3])))
     if unposed:
-        notes.append(f"views without pose: {', '.join(unposed)}")
+        remarks.append(Remark.of(Code.VIEWS_UNPOSED, names=", ".join(unposed)))
     if unused:
-        notes.append(f"{counted(len(unused), 'camera')} without view: {name_some(unused)}")
+        remarks.append(Remark.of(Code.CAMERAS_UNUSED, cameras=len(unused), names=unused))
     if shared:
-        notes.append(f"several views or cameras share the name of {name_some(shared)}; rename them")
-    of_views, of_cameras = _numbers(wanted), set() if how == _IN_ORDER else _numbers(owners)
-    warnings = [
-        f"the numbers in names of cameras are those of the views {apart:+d}: if one was counted from 0 and the other "
-        "from 1, views have the poses of their neighbours; rename the files of one"
+        remarks.append(Remark.of(Code.NAMES_SHARED, names=shared))
+    of_views, of_cameras = _numbers(wanted), set() if is_by_order else _numbers(owners)
+    remarks += [
+        Remark.of(Code.NUMBERS_SHIFTED, apart=f"{apart:+d}")
         for apart in (1, -1)
         if of_cameras and {number + apart for number in of_views} == of_cameras
     ]
-    return {view: poses.cameras[found[view]] for view in wanted if view in found}, notes, warnings
+    return {view: poses.cameras[found[view]] for view in wanted if view in found}, remarks
 
 
 def _by_names(owners: dict[str, list[str]], wanted: dict[str, list[str]]) -> dict[str, str]:

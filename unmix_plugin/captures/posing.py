@@ -32,8 +32,9 @@ from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera, PoseSet, where_rays_meet
 from unmix_plugin.captures.poses.reading import read_poses
+from unmix_plugin.captures.report import Code, Kind, Remark, merged, sentences
 from unmix_plugin.engine.geometry.camera_paths import focus_point, meeting_point
-from unmix_plugin.errors import CaptureError, ConfigError, counted, did_you_mean, name_some
+from unmix_plugin.errors import CaptureError, ConfigError, did_you_mean
 from unmix_plugin.scenes.folder import METRES_KEY
 from unmix_plugin.scenes.placement import Placement
 
@@ -72,12 +73,11 @@ class PosedViews:
     views: tuple[CaptureView, ...]
     poses: PoseSet
     """In the scene's world: cameras by view, each with the lens of the whole image in its file; the sparse points."""
-    findings: tuple[str, ...]
-    """What looks wrong, one sentence each."""
     keys: dict[str, Any]
     """What transforms.json records of the way from the source's world to the scene's, and of metres. Where the poses
     were estimated, exports return to the scene's world, which stands upright: there is no way, or only a scale."""
-    notes: tuple[str, ...]
+    remarks: tuple[Remark, ...]
+    """Whose poses are whose, and where the scene lies."""
 
 
 def given_poses(capture: Capture, where: str | None) -> PoseSet:
@@ -85,7 +85,7 @@ def given_poses(capture: Capture, where: str | None) -> PoseSet:
     CaptureError: there are none, or they can't be read."""
     if where is None:
         if capture.poses is None:
-            why = "".join(f" ({note})" for note in capture.notes if "poses" in note)
+            why = f" ({capture.no_poses})" if capture.no_poses else ""
             raise CaptureError(
                 f"{capture.root}: the layout '{capture.layout}' has no poses{why}; give --poses with transforms.json, "
                 f"a COLMAP model or another file, or find them: '--poses {ESTIMATE}', '{MARKERS}' or '{TURNTABLE}'"
@@ -104,14 +104,13 @@ def pose_views(
     Poses that don't tell metres get them from a distance that is known. Raises CaptureError: fewer than two views have
     a camera, or a lens does not fit its view. Raises ConfigError: the distance does not go with the poses."""
     files = [(view.name, [*view.cube.files, *filter(None, [view.picture])]) for view in views]
-    cameras, said, doubts = match_poses(poses, files)
+    cameras, matched = match_poses(poses, files)
     cameras, completed = _complete_rigs(views, cameras)
-    matched = [note for note in said if not (completed and "without pose" in note)]
     posed = tuple(view for view in views if view.name in cameras)
     if len(posed) < _LEAST_VIEWS:
         raise CaptureError(
             f"{poses.source}: {len(posed)} of {len(views)} views has a pose; a scene needs {_LEAST_VIEWS} or more. "
-            + "; ".join(said)
+            + "; ".join(sentences(matched, Kind.DONE))
         )
     given = {view.name: cameras[view.name].lens or view.lens for view in posed}
     fitted = {
@@ -119,48 +118,46 @@ def pose_views(
     }
     has_many_lenses = len({view.sensor for view in posed if view.release}) > 1
     own = {view.sensor: view.lens for view in posed if view.lens and view.lens == given[view.name]}
-    of_views = [f"lens {sensor}: {lens.said}" for sensor, lens in own.items() if lens.said]
+    lenses = [
+        Remark.of(Code.LENS_OF_SENSOR, lens=name, text=lens.said) for name, lens in own.items() if lens.said
+    ]
     placed, way, how = _place_poses(replace(poses, cameras=fitted), is_flight=has_many_lenses)
     metres, keys = poses.metres_per_unit, way.to_json() if poses.has_world else {}
     if known is not None:
         if metres is not None:
             raise ConfigError(f"--known-distance: {poses.source} gives metres already; leave it out")
         metres, scaled_by = _metres_per_unit(known, fitted if poses.has_world else placed.cameras)
-        how = (*how, scaled_by)
+        how.append(scaled_by)
         if not poses.has_world:  # exports return to the scene's upright world, in metres
             keys, metres = Placement(scale=1.0 / metres).to_json(), 1.0
     if metres is not None and keys:
         keys[METRES_KEY] = metres
-    cut, scaled = _other_sizes(posed, given)
-    notes = (*poses.notes, *matched, *completed, *of_views, *scaled, *how)
-    findings = [*doubts, *cut]
+    remarks = [Remark.of(Code.NOTE, text=text) for text in poses.notes]
     missing = [view.name for view in views if view not in posed]
     if len(missing) > _MOST_UNPOSED * len(views):  # so many that the source itself is suspect
-        left_out = f"views have no pose and are left out ({name_some(missing)})"
-        whole = f"is {poses.source} the whole model, and are the names in it those of the files?"
-        findings.insert(0, f"{len(missing)} of {len(views)} {left_out}: {whole}")
-    return PosedViews(posed, placed, tuple(findings), keys, notes)
+        facts = {"unposed": len(missing), "views": len(views), "names": missing, "source": poses.source}
+        remarks.append(Remark.of(Code.MANY_VIEWS_UNPOSED, **facts))
+    if completed:  # which says of each lens what became of views without a pose
+        matched = [remark for remark in matched if remark.code is not Code.VIEWS_UNPOSED]
+    remarks += [*matched, *completed, *lenses, *_other_sizes(posed, given), *how]
+    return PosedViews(posed, placed, keys, tuple(remarks))
 
 
-def _other_sizes(
-    posed: Sequence[CaptureView], lenses: Mapping[str, Lens | None]
-) -> tuple[list[str], list[str]]:
-    """Lenses given for pictures of another size: a finding where it is no whole multiple, so that they were cut,
-    perhaps, and not scaled; and notes of the others."""
-    findings, notes = [], []
+def _other_sizes(posed: Sequence[CaptureView], lenses: Mapping[str, Lens | None]) -> list[Remark]:
+    """Lenses given for pictures of another size: the first that is no whole multiple, so that it was cut, perhaps, and
+    not scaled; and the others."""
+    cut, scaled = [], []
     for view in posed:
         lens, (height, width, _) = lenses[view.name], view.cube.shape
         if lens is None or lens.width == width:
             continue
-        given, ratio = f"{lens.width} x {lens.height} pixels", max(width / lens.width, lens.width / width)
+        ratio = max(width / lens.width, lens.width / width)
+        facts = {"given": f"{lens.width} x {lens.height} pixels", "size": f"{width} x {height}"}
         if abs(ratio - round(ratio)) <= _MOST_STRETCH * ratio:
-            notes.append(f"lenses given for {given} were scaled to {width} x {height}")
-        elif not findings:
-            findings.append(
-                f"the lens of view {view.name} is given for {given}, its file has {width} x {height}: taken as "
-                "scaled. If it was cut instead, give the lens of the cut picture"
-            )
-    return findings, list(dict.fromkeys(notes))
+            scaled.append(Remark.of(Code.LENS_SCALED, **facts))
+        elif not cut:
+            cut.append(Remark.of(Code.LENS_PERHAPS_CUT, view=view.name, **facts))
+    return [*cut, *merged(scaled)]
 
 
 def lens_of_view(lens: Lens | None, view: CaptureView) -> Lens:
@@ -186,16 +183,16 @@ def lens_of_view(lens: Lens | None, view: CaptureView) -> Lens:
 
 def _complete_rigs(
     views: Sequence[CaptureView], cameras: Mapping[str, PosedCamera]
-) -> tuple[dict[str, PosedCamera], tuple[str, ...]]:
+) -> tuple[dict[str, PosedCamera], list[Remark]]:
     """Cameras by view, also of views that get the pose of another lens of their release, moved by the rig; and what
-    was done, one sentence a lens."""
+    was done with each lens."""
     releases: dict[str, list[CaptureView]] = defaultdict(list)
     for view in views:
         if view.release:
             releases[view.release].append(view)
     measured = _measured_offsets(releases, cameras)
     lenses = {view.sensor: cameras[view.name].lens for view in views if view.name in cameras}
-    completed, how = dict(cameras), Counter[tuple[str, str]]()
+    completed, how = dict(cameras), Counter[tuple[str, Code]]()
     for members in releases.values():
         posed = [view for view in members if view.name in cameras]
         for view in members:
@@ -209,16 +206,10 @@ def _complete_rigs(
                 base, offset = (by_poses or by_files)[0]
                 pose = _square(cameras[base.name].camera_to_world) @ offset
                 completed[view.name] = PosedCamera(pose[:3], lenses.get(view.sensor) or view.lens)
-            kind = "unknown" if posed else "unposed"
-            how[view.sensor, "poses" if by_poses else "files" if by_files else kind] += 1
-    said = {
-        "unposed": "left out: no lens of their release has a pose",
-        "unknown": "left out: there is no pose, and nothing says where the lens is on the rig",
-        "poses": "got the pose of another lens of their release, moved as in other releases",
-        "files": "got the pose of another lens of their release, turned as the files say, at the same place",
-    }
-    notes = [f"{counted(n, 'view')} of lens {sensor} {said[kind]}" for (sensor, kind), n in how.items()]
-    return completed, tuple(notes)
+            code = Code.RIG_OFFSET_UNKNOWN if posed else Code.RIG_WITHOUT_POSE
+            code = Code.RIG_AS_FILES_SAY if by_files else code
+            how[view.sensor, Code.RIG_AS_OTHER_RELEASES if by_poses else code] += 1
+    return completed, [Remark.of(code, views=n, lens=sensor) for (sensor, code), n in how.items()]
 
 
 def _measured_offsets(
@@ -259,7 +250,7 @@ def _square(pose: Float64[np.ndarray, "3 4"]) -> _Pose:
     return np.vstack([pose, [0.0, 0.0, 0.0, 1.0]])
 
 
-def _place_poses(poses: PoseSet, is_flight: bool = False) -> tuple[PoseSet, Placement, tuple[str, ...]]:
+def _place_poses(poses: PoseSet, is_flight: bool = False) -> tuple[PoseSet, Placement, list[Remark]]:
     """Poses in the scene's world, the way there from the source's, and how up axis, middle and scale were found. In a
     flight, cameras that all look one way look down."""
     stacked = np.stack([camera.camera_to_world for camera in poses.cameras.values()])
@@ -270,39 +261,39 @@ def _place_poses(poses: PoseSet, is_flight: bool = False) -> tuple[PoseSet, Plac
     rotation = _turn_to_z(up)
     inner = Placement(rotation, -rotation @ middle, scale)
     placed = replace(poses.moved(inner), offset=np.zeros(3), up=np.array([0.0, 0.0, 1.0]))
-    how_large = [f"1 unit of the scene is {1.0 / scale:.6g} of the source"] if poses.has_world else []
-    return placed, replace(inner, offset=poses.offset), (how_up, how_middle, *how_large)
+    how = [Remark.of(how_up), Remark.of(how_middle)]
+    how += [Remark.of(Code.UNIT_OF_SCENE, units=f"{1.0 / scale:.6g}")] if poses.has_world else []
+    return placed, replace(inner, offset=poses.offset), how
 
 
 def _find_up(
     poses: Float64[np.ndarray, "N 3 4"], known: Float64[np.ndarray, "3"] | None, is_flight: bool
-) -> tuple[Float64[np.ndarray, "3"], str]:
+) -> tuple[Float64[np.ndarray, "3"], Code]:
     if known is not None:
-        return known, "up is the source's"
+        return known, Code.UP_OF_SOURCE
     back = poses[:, :, 2].mean(axis=0)
     if is_flight and np.linalg.norm(back) > np.cos(np.radians(_MOST_SWAY_DEG)):
-        return back / np.linalg.norm(back), "up is against where the cameras look, as they would in a flight"
+        return back / np.linalg.norm(back), Code.UP_AGAINST_FLIGHT
     mean = poses[:, :, 1].mean(axis=0)
     _, singular, vt = np.linalg.svd(poses[:, :, 0], full_matrices=True)
     is_spread = len(singular) > 1 and singular[1] > np.sin(np.radians(_LEAST_TURN_DEG)) * singular[0]
     vertical = vt[2] * (1.0 if vt[2] @ mean >= 0 else -1.0)
     if is_spread and vertical @ mean > 0.5 * np.linalg.norm(mean) > 0.05:
-        return vertical, "up is square to the cameras' horizontal axes"
+        return vertical, Code.UP_BY_AXES
     if np.linalg.norm(mean) > 0.1:
-        return mean / np.linalg.norm(mean), "up is the mean of the cameras' up vectors"
-    return np.array([0.0, 0.0, 1.0]), "up is not to be told from the cameras: +z of the source is taken"
+        return mean / np.linalg.norm(mean), Code.UP_BY_MEAN
+    return np.array([0.0, 0.0, 1.0]), Code.UP_UNKNOWN
 
 
 def _find_middle(
     poses: Float64[np.ndarray, "N 3 4"], points: Float64[np.ndarray, "P 3"] | None
-) -> tuple[Float64[np.ndarray, "3"], str]:
+) -> tuple[Float64[np.ndarray, "3"], Code]:
     met, nearest = meeting_point(poses), focus_point(poses)
     if met is None and points is not None and len(points) > 0:
-        how = "the middle is that of the sparse points, as the cameras look at no one place"
-        return np.median(points, axis=0), how
+        return np.median(points, axis=0), Code.MIDDLE_OF_POINTS
     if nearest is not None:
-        return nearest, "the middle is the point nearest to all optical axes"
-    return poses[:, :, 3].mean(axis=0), "the middle is that of the cameras"
+        return nearest, Code.MIDDLE_OF_AXES
+    return poses[:, :, 3].mean(axis=0), Code.MIDDLE_OF_CAMERAS
 
 
 def _turn_to_z(up: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
@@ -352,8 +343,8 @@ def _parse_pixel(text: str, sizes: Mapping[str, tuple[int, int]]) -> tuple[str, 
     return name, (column + 0.5, row + 0.5)
 
 
-def _metres_per_unit(known: KnownDistance, cameras: Mapping[str, PosedCamera]) -> tuple[float, str]:
-    """Metres in a unit of the world that cameras with lenses stand in, and a sentence about it. Raises ConfigError: a
+def _metres_per_unit(known: KnownDistance, cameras: Mapping[str, PosedCamera]) -> tuple[float, Remark]:
+    """Metres in a unit of the world that cameras with lenses stand in, and how sure that is. Raises ConfigError: a
     view has no pose, the pixels of a point are not those of one, or the points are the same."""
     ends = np.stack([_meet(number, point, cameras) for number, point in enumerate(known[:2], 1)])
     shown = [cameras[name].pixels_of(ends) for point in known[:2] for name in point]
@@ -363,9 +354,9 @@ def _metres_per_unit(known: KnownDistance, cameras: Mapping[str, PosedCamera]) -
             f"{_FLAG}: the two points are {apart:.1f} px apart; expected more than {_LEAST_APART_PX:g}: are they the "
             "same?"
         )
-    said = f"the scale is that of two points {known[2]:g} m apart, {apart:.0f} px in the view that shows most"
-    said += f": 1 px off there is {1 / apart:.1%} of all lengths or more"
-    return known[2] / float(np.linalg.norm(ends[1] - ends[0])), said
+    facts = {"metres": f"{known[2]:g}", "pixels": f"{apart:.0f}", "share": f"{1 / apart:.1%}"}
+    remark = Remark.of(Code.SCALE_BY_DISTANCE, **facts)
+    return known[2] / float(np.linalg.norm(ends[1] - ends[0])), remark
 
 
 def _meet(number: int, point: _Seen, cameras: Mapping[str, PosedCamera]) -> Float64[np.ndarray, "3"]:

@@ -126,7 +126,7 @@ def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list
         found = poses_of_written_views(plan, sound, folder.path, folder.poses, options)
         posed = pose_views(_without(plan.views, left_out), found, known)
         _refuse_late(_resampled_lenses(plan, posed))
-    for note in posed.notes:
+    for note in sentences(posed.remarks, Kind.DONE):
         say(f"poses: {note}")
     posed = replace(posed, views=tuple(_without(posed.views, left_out)))
     matched = match_views(seen_views(folder.path, plan, posed, records))

@@ -85,6 +85,14 @@ class Code(Enum):
     )
     LAYER_TAKEN = _doubt("layer '{layer}' is taken; the file also has {others} (--dataset)")
     BANDS_OF_OTHER_KINDS = _done("{number} {pictures} than {kind} in the folder left out")
+    PARTS_JOINED = _done("{parts} parts of one scan were joined: {names:6}")
+    MOSAIC_TAKEN_APART = _done(
+        "a mosaic of {filters} filters was taken apart: bands of one pixel lie up to {apart} pixels of the file beside "
+        "each other"
+    )
+    MOSAIC_RIM_LEFT_OUT = _done(
+        "{rows} rows and {columns} columns at the end, which fill no block, are left out"
+    )
     MASK_OF_OTHER_SIZE = _doubt(
         "the mask {mask} has {size} rows, columns and bands, not those of the image: not used"
     )
@@ -184,6 +192,53 @@ class Code(Enum):
     )
     VIEW_UNREADABLE = _wrong("{where} is left out, as its file can't be read: {why}")
     VIEW_NOT_WANTED = _done("{where} is left out, as --leave-out says")
+
+    # Poses: whose they are, and where the scene lies.
+    POSES_MATCHED = _done("{matched} of {views} views were matched {how}")
+    NAMES_AS_TEXTS = _done(
+        "names were sorted as texts: {first}; if poses go by numbers, give these leading zeros"
+    )
+    VIEWS_UNPOSED = _done("views without pose: {names}")
+    CAMERAS_UNUSED = _done("{cameras:camera} without view: {names}")
+    NAMES_SHARED = _done("several views or cameras share the name of {names}; rename them")
+    NUMBERS_SHIFTED = _wrong(
+        "the numbers in names of cameras are those of the views {apart}: if one was counted from 0 and the other from "
+        "1, views have the poses of their neighbours; rename the files of one"
+    )
+    MANY_VIEWS_UNPOSED = _wrong(
+        "{unposed} of {views} views have no pose and are left out ({names}): is {source} the whole model, and are the "
+        "names in it those of the files?"
+    )
+    RIG_WITHOUT_POSE = _done("{views:view} of lens {lens} left out: no lens of their release has a pose")
+    RIG_OFFSET_UNKNOWN = _done(
+        "{views:view} of lens {lens} left out: there is no pose, and nothing says where the lens is on the rig"
+    )
+    RIG_AS_OTHER_RELEASES = _done(
+        "{views:view} of lens {lens} got the pose of another lens of their release, moved as in other releases"
+    )
+    RIG_AS_FILES_SAY = _done(
+        "{views:view} of lens {lens} got the pose of another lens of their release, turned as the files say, at the "
+        "same place"
+    )
+    LENS_OF_SENSOR = _done("lens {lens}: {text}")
+    LENS_SCALED = _done("lenses given for {given} were scaled to {size}")
+    LENS_PERHAPS_CUT = _wrong(
+        "the lens of view {view} is given for {given}, its file has {size}: taken as scaled. If it was cut instead, "
+        "give the lens of the cut picture"
+    )
+    UP_OF_SOURCE = _done("up is the source's")
+    UP_AGAINST_FLIGHT = _done("up is against where the cameras look, as they would in a flight")
+    UP_BY_AXES = _done("up is square to the cameras' horizontal axes")
+    UP_BY_MEAN = _done("up is the mean of the cameras' up vectors")
+    UP_UNKNOWN = _done("up is not to be told from the cameras: +z of the source is taken")
+    MIDDLE_OF_POINTS = _done("the middle is that of the sparse points, as the cameras look at no one place")
+    MIDDLE_OF_AXES = _done("the middle is the point nearest to all optical axes")
+    MIDDLE_OF_CAMERAS = _done("the middle is that of the cameras")
+    UNIT_OF_SCENE = _done("1 unit of the scene is {units} of the source")
+    SCALE_BY_DISTANCE = _done(
+        "the scale is that of two points {metres} m apart, {pixels} px in the view that shows most: 1 px off there is "
+        "{share} of all lengths or more"
+    )
 
     # Masks.
     NO_MASK_FOUND = _wrong(

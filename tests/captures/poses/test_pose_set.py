@@ -5,6 +5,7 @@ import pytest
 from tests.captures.poses.pose_factory import ring_set
 from unmix_plugin.captures.names import match_poses
 from unmix_plugin.captures.poses.pose_set import PoseSet
+from unmix_plugin.captures.report import Code, Kind, sentences
 from unmix_plugin.errors import CaptureError
 
 
@@ -52,7 +53,8 @@ def named(*names):
 )
 def test_views_get_the_cameras_of_their_names_and_what_is_odd_is_said(cameras, views, expected, said):
     poses = named(*cameras)
-    found, notes, _ = match_poses(poses, list(views.items()))
+    found, remarks = match_poses(poses, list(views.items()))
+    notes = sentences(remarks, Kind.DONE)
     assert set(found) == set(expected)
     assert all(found[view] is poses.cameras[name] for view, name in expected.items())
     assert [text in note for text, note in zip(said, notes, strict=True)] == [True] * len(said)
@@ -80,7 +82,8 @@ def test_names_that_do_not_fit_at_all_are_refused():
 def test_numbers_counted_from_0_and_from_1_are_told(cameras, views, is_doubtful, name):
     """Those of names, which cameras without any have not."""
     poses = named(*(name.format(number) for number in cameras))
-    found, _, warnings = match_poses(poses, [(f"cube_{number}", []) for number in views])
+    found, remarks = match_poses(poses, [(f"cube_{number}", []) for number in views])
     assert found
-    assert ["those of the views" in text for text in warnings] == [True] * is_doubtful
-    assert match_poses(named("#0000", "#0001"), [("v1", []), ("v2", [])])[2] == []
+    assert (Code.NUMBERS_SHIFTED in {remark.code for remark in remarks}) == is_doubtful
+    _, remarks = match_poses(named("#0000", "#0001"), [("v1", []), ("v2", [])])
+    assert Code.NUMBERS_SHIFTED not in {remark.code for remark in remarks}

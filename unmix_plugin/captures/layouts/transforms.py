@@ -159,15 +159,16 @@ def _make_capture(
     """Views, one a frame, in the order of their names; poses that can't be used are noted, as others may be given."""
     posed = dict(zip((frame.name for frame in listed.frames), views, strict=True))
     sizes = {name: (view.cube.shape[1], view.cube.shape[0]) for name, view in posed.items()}
-    poses, said = None, [*listed.notes, *notes]
+    poses, no_poses = None, ""
     try:
         poses = read_transforms(listed.contents, sizes)
         cameras = {view.name: poses.cameras[name] for name, view in posed.items() if name in poses.cameras}
         poses = replace(poses, cameras=cameras)
     except CaptureError as error:
-        said.append(f"the poses of the capture can't be used: {error}")
+        no_poses = f"the poses of the capture can't be used: {error}"
+    said = (*listed.notes, *notes, *filter(None, [no_poses]))
     ordered = sorted(views, key=lambda view: natural_order(view.name))
-    return Capture(layout, root, tuple(ordered), poses, tuple(said), tuple(warnings))
+    return Capture(layout, root, tuple(ordered), poses, said, tuple(warnings), no_poses=no_poses)
 
 
 def find_nerfstudio(root: Path, options: ReadOptions) -> Capture:
@@ -390,7 +391,7 @@ def find_nespof_real(root: Path, options: ReadOptions) -> Capture:
         views.append(CaptureView(name, _stack_intensities(files, options)))
     if not path.is_file():
         missing = f"{_POSES} is not there: the layout has no poses"
-        return Capture("nespof-real", root, tuple(views), notes=(missing,))
+        return Capture("nespof-real", root, tuple(views), notes=(missing,), no_poses=missing)
     poses = read_poses(path, {view.name: (view.cube.shape[1], view.cube.shape[0]) for view in views})
     if len(poses.cameras) != len(views):
         raise CaptureError(

@@ -13,7 +13,8 @@ import numpy as np
 
 from unmix_plugin.captures.cube import Cube
 from unmix_plugin.captures.numbers import Decoded, Numbers
-from unmix_plugin.errors import CaptureError, name_some
+from unmix_plugin.captures.report import Code, Remark, merged
+from unmix_plugin.errors import CaptureError
 
 _MOSAICS = ((2, 2), (3, 3), (4, 4), (5, 5), (2, 4), (6, 6))
 """Rows and columns of filters that cameras have (imec, XIMEA, Bayer)."""
@@ -46,15 +47,14 @@ def join_lines(parts: Sequence[Cube]) -> Cube:
     block = Decoded(
         first.path, first.dtype.newbyteorder("="), shape, _copy_lines, (pieces,), units=(1, *shape[1:])
     )
-    note = f"{len(parts)} parts of one scan were joined: {name_some([part.path.name for part in parts], 6)}"
+    joined = Remark.of(Code.PARTS_JOINED, parts=len(parts), names=[part.path.name for part in parts])
     return replace(
         first,
         shape=shape,
         dtype=block.dtype,
         numbers=Numbers((block,), shape, "yxb", block.dtype),
         first_line=0,
-        notes=(*dict.fromkeys(said for part in parts for said in part.notes), note),
-        warnings=tuple(dict.fromkeys(said for part in parts for said in part.warnings)),
+        remarks=(*merged(remark for part in parts for remark in part.remarks), joined),
         sources=tuple(source for part in parts for source in part.files),
     )
 
@@ -94,13 +94,10 @@ def take_apart(mosaic: Cube, filters: tuple[int, int]) -> Cube:
         units=(1, *shape[1:]),
     )
     cut = (height % rows, width % columns)
-    beside = f"bands of one pixel lie up to {max(filters) - 1} pixels of the file beside each other"
-    notes = [f"a mosaic of {rows} x {columns} filters was taken apart: {beside}"]
-    notes += (
-        [f"{cut[0]} rows and {cut[1]} columns at the end, which fill no block, are left out"]
-        if any(cut)
-        else []
-    )
+    filters_named = f"{rows} x {columns}"
+    remarks = [Remark.of(Code.MOSAIC_TAKEN_APART, filters=filters_named, apart=max(filters) - 1)]
+    if any(cut):
+        remarks.append(Remark.of(Code.MOSAIC_RIM_LEFT_OUT, rows=cut[0], columns=cut[1]))
     return replace(
         mosaic,
         shape=shape,
@@ -110,7 +107,7 @@ def take_apart(mosaic: Cube, filters: tuple[int, int]) -> Cube:
         bands=replace(mosaic.bands, wavelengths_nm=None, fwhm_nm=None, bad=None, names=None),
         is_srgb=False,
         masks=(),
-        notes=(*mosaic.notes, *notes),
+        remarks=(*mosaic.remarks, *remarks),
     )
 
 

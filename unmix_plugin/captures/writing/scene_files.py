@@ -105,7 +105,7 @@ def write_scene_files(
     findings = sentences(left_out, Kind.WRONG)
     findings += dict.fromkeys((*sentences(plan.remarks, Kind.WRONG), *posed.poses.warnings))
     measured = check_views([v for v in seen if v.record.sensor in alike], posed.poses.points, findings)
-    findings += posed.findings
+    findings += sentences(posed.remarks, Kind.WRONG)
     check_files(posed.views, options, findings)
     for name, sensor in plan.sensors.items():
         same = [view for view in seen if view.record.sensor == name]
@@ -128,7 +128,7 @@ def write_scene_files(
         "decisions": plan.decisions,
         "decided": [decision.to_json() for decision in decided],
         "stored": {"type": "uint16", "value_scale": FULL_SCALE, "calibrated_value_of_1": plan.scale.value},
-        "poses": {"source": posed.poses.source, "notes": list(posed.notes), **posed.keys},
+        "poses": {"source": posed.poses.source, "notes": sentences(posed.remarks, Kind.DONE), **posed.keys},
         "notes": sentences(plan.remarks, Kind.DONE),
         "what_looks_wrong": findings,
         "left_out": [remark.to_json() for remark in left_out],
@@ -317,7 +317,7 @@ def _what_was_done(plan: Plan, posed: PosedViews, views: Sequence[ViewRecord]) -
         rules = [r.background for r in plan.recipes.values() if isinstance(r.background, BackgroundRule)]
         levels = ", ".join(f"{rule.level:.3f} (threshold {rule.threshold:.3f})" for rule in rules)
         lines.append(f"{plan.mask} background at {levels}; {share}; {changed}")
-    return [*lines, *posed.notes, *sentences(plan.remarks, Kind.DONE)]
+    return [*lines, *(text for one in (posed, plan) for text in sentences(one.remarks, Kind.DONE))]
 
 
 def _left_out(sensor: SensorPlan) -> dict[str, str]:
