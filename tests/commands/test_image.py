@@ -131,6 +131,98 @@ def test_the_dark_lines_of_a_file_are_subtracted_from_raw_numbers_alone(cube, ga
     np.testing.assert_allclose(taken[0], expected[..., ::-1])
 
 
+def unmixed(monkeypatch, *words):
+    """What is unmixed with these words, its mask, and what is printed."""
+    taken = []
+
+    def take(values, *_, mask, **__):
+        taken.append((values, mask))
+        raise SpectrumError("taken")
+
+    monkeypatch.setattr("unmix_plugin.spectral.unmixing.image.unmix_image", take)
+    ended = run(image, *words, "--endmembers", 3)
+    assert taken, ended.err
+    return *taken[0], ended.out
+
+
+@pytest.fixture
+def raw(cube, tmp_path):
+    """Raw counts of reflectances under a lamp, with a white panel of 0.5 and a dark frame."""
+    lamp, dark = np.linspace(3000, 9000, 24), np.linspace(100, 300, 24)
+    rng, columns = np.random.default_rng(0), np.linspace(0.8, 1.2, 20)[:, None]
+    named = "wavelength units = nm\nwavelength = {" + ", ".join(map(str, range(450, 690, 10))) + "}\n"
+
+    def counts(values):
+        return np.rint(values * lamp * columns + dark + rng.normal(0, 1, values.shape)).astype(np.uint16)
+
+    for name, values in (
+        ("view", cube),
+        ("white", np.full((9, 20, 24), 0.5)),
+        ("dark", np.zeros((9, 20, 24))),
+    ):
+        write_envi(tmp_path / f"{name}.hdr", counts(values), "bil", named)
+    return tmp_path
+
+
+def test_raw_counts_become_reflectance_by_white_and_dark(cube, raw, monkeypatch):
+    words = (
+        raw / "view.hdr",
+        "--white",
+        raw / "white.hdr",
+        "--dark",
+        raw / "dark.hdr",
+        "--output-dir",
+        raw / "out",
+    )
+    values, mask, said = unmixed(monkeypatch, *words, "--white-reflectance", 0.5)
+    assert mask.all()
+    np.testing.assert_allclose(values, cube, atol=0.01)
+    assert "raw counts" not in said
+    assert "mean of 9 lines, column by column" in said
+    (raw / "panel.csv").write_text("Wellenlänge [nm];Reflexion (%)\n440;50,0\n700;50,0\n", "cp1252")
+    values, _, _ = unmixed(monkeypatch, *words, "--white-reflectance", raw / "panel.csv")
+    np.testing.assert_allclose(values, cube, atol=0.01)
+
+
+def test_raw_counts_without_a_white_are_said_to_be_raw(cube, raw, monkeypatch):
+    _, _, said = unmixed(monkeypatch, raw / "view.hdr", "--output-dir", raw / "out")
+    assert "looks wrong: the numbers are raw counts" in said
+    assert "give --white and --dark" in said
+    _, _, said = unmixed(
+        monkeypatch, raw / "view.hdr", "--white", raw / "white.hdr", "--output-dir", raw / "out"
+    )
+    assert "no dark frame" in said
+    bands = Bands.of(np.linspace(450, 900, cube.shape[2]))
+    write_envi_cube(raw / "field", cube, bands, None, "a field")
+    _, _, said = unmixed(monkeypatch, raw / "field.hdr", "--output-dir", raw / "out")
+    assert "raw counts" not in said
+
+
+def test_pixels_that_are_black_in_a_mask_are_left_out(raw, monkeypatch):
+    shown = np.zeros((20, 20), bool)
+    shown[4:12, 3:17] = True
+    Image.fromarray((shown * 255).astype(np.uint8)).save(raw / "mask.png")
+    words = raw / "view.hdr", "--mask", raw / "mask.png", "--output-dir", raw / "out"
+    _, mask, said = unmixed(monkeypatch, *words)
+    np.testing.assert_array_equal(mask, shown)
+    assert "pixels left out by" in said
+    Image.fromarray(np.zeros((20, 19), np.uint8)).save(raw / "mask.png")
+    assert "mask.png" in refused(image, *words)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--white-reflectance", "0.9"), "--white-reflectance needs a white reference"),
+        (("--white", "{0}/none.hdr"), "no such file"),
+        (("--white", "{0}/dark.hdr", "--dark", "{0}/white.hdr"), "are white and dark swapped"),
+    ],
+)
+def test_references_that_can_t_be_are_refused(words, message, raw):
+    told = [word.format(raw) for word in words]
+    assert message in refused(image, raw / "view.hdr", *told, "--output-dir", raw / "out")
+
+
 @pytest.mark.parametrize(
     ("change", "words", "message"),
     [

@@ -15,6 +15,8 @@ from unmix_plugin.errors import CaptureError, ConfigError, counted
 if TYPE_CHECKING:
     import numpy as np
 
+    from unmix_plugin.captures.calibration.one_image import CalibratedImage
+    from unmix_plugin.captures.calibration.references import GivenReferences
     from unmix_plugin.captures.cube import Cube
     from unmix_plugin.spectral.features import NoiseFractions
     from unmix_plugin.spectral.library.material_library import MaterialLibrary
@@ -29,6 +31,14 @@ class _ImageOptions(ReadingOptions):
 
     file: Annotated[Path, tyro.conf.Positional]
     """An image of any format that unmix-process reads, or a folder with one picture a band."""
+    white: Path | None = None
+    """White reference: an image of a white panel; the image becomes reflectance."""
+    dark: Path | None = None
+    """Dark frame: an image taken with the shutter closed."""
+    white_reflectance: str = "1"
+    """Reflectance of the white panel: a number, or a table (wavelength,reflectance)."""
+    mask: Path | None = None
+    """Picture of the image's size that is black where pixels are left out."""
     endmembers: int | Literal["auto"] = "auto"
     """How many materials to find; auto proposes a number and prints why."""
     shares: Literal["auto", "area", "light"] = "auto"
@@ -52,7 +62,7 @@ def image(argv: list[str]) -> None:
     """Parse the arguments, unmix, write, and say what was found."""
     options = tyro.cli(_ImageOptions, prog="unmix-image", args=argv)
 
-    from unmix_plugin.captures.calibration.references import find_missing, own_dark_mean, stated_values
+    from unmix_plugin.captures.calibration.one_image import calibrate_image
     from unmix_plugin.captures.readers.opening import open_spectral_file
     from unmix_plugin.engine.runs.replacing import remove
     from unmix_plugin.formats.files import NOT_PORTABLE, refuse_to_overwrite, safe_name
@@ -64,52 +74,59 @@ def image(argv: list[str]) -> None:
     all_paths = unmixed_image_paths(folder, True, True)
     refuse_to_overwrite(all_paths, options.overwrite)
     opened = open_spectral_file(options.file, options.for_readers())
-    bands, wavelengths = _good_bands(opened)
-    stored = opened.read(bands=bands)
-    # EnMAP has no numbers where the air lets no light through.
-    each = [find_missing(stored[..., [i]], opened, bands=bands[[i]]) for i in range(len(bands))]
-    measured = [i for i, missing in enumerate(each) if not missing.all()]
-    if 0 < len(measured) < len(bands):
-        bands, stored = bands[measured], stored[..., measured]
-        wavelengths = None if wavelengths is None else wavelengths[measured]
-    mask = ~find_missing(stored, opened, bands=bands)
-    cube = stated_values(opened, stored, slice(0, opened.shape[0]), bands)
-    if (dark := own_dark_mean(opened)) is not None:
-        cube -= dark[..., bands]
+    given = _references(options)
+    calibrated = calibrate_image(opened, given, options.white_reflectance, options.mask)
+    cube, mask = calibrated.values, calibrated.mask
     if not mask.any():
         raise CaptureError(f"{options.file}: no pixel holds a measurement in all bands")
-    library = _library(options, wavelengths)
-    _say_what_was_read(opened, mask, len(bands), library is not None)
+    library = _library(options, calibrated.wavelengths_nm)
+    _say_what_was_read(opened, calibrated, library is not None)
     fractions = _fractions(cube, mask, options.mnf)
     found = unmix_image(cube, options.endmembers, mask=mask, shares=options.shares, seed=options.seed)
     place = dict(opened.map_entries) or None
     remove(*({*all_paths} - {*paths}))  # they would tell of other materials
-    names = write_unmixed_image(folder, found, wavelengths, bands + 1, place, library, fractions)
+    names = write_unmixed_image(
+        folder, found, calibrated.wavelengths_nm, calibrated.bands + 1, place, library, fractions
+    )
     _say(found, mask, names)
     for path in paths:
         tell(f"  {path}")
 
 
-def _say_what_was_read(opened: Cube, mask: np.ndarray, num_bands: int, is_compared: bool) -> None:
+def _references(options: _ImageOptions) -> GivenReferences:
+    from unmix_plugin.captures.calibration.references import GivenReferences
+    from unmix_plugin.captures.readers.opening import open_spectral_file
+
+    opened: dict[str, Cube] = {}
+    for path, kind in ((options.dark, "dark"), (options.white, "white")):
+        if path is not None:
+            if not path.exists():
+                raise CaptureError(f"--{kind} {path}: no such file; give the image of the reference")
+            opened[kind] = open_spectral_file(path, options.for_readers())
+    return GivenReferences(**opened)
+
+
+def _say_what_was_read(opened: Cube, calibrated: CalibratedImage, is_compared: bool) -> None:
     """Size, doubts and notes of a file, and what of it is left out."""
     from unmix_plugin.captures.calibration.references import stated_reflectance
     from unmix_plugin.captures.report import Kind, sentences
     from unmix_plugin.trained.run_materials import LIGHT_UNKNOWN
 
+    mask, num_bands = calibrated.mask, len(calibrated.bands)
     size = f"{mask.shape[0]} x {mask.shape[1]} pixels, {counted(num_bands, 'band')}"
     tell(f"{opened.path}: {size}")
-    for warning in sentences(opened.remarks, Kind.WRONG):
+    for warning in (*sentences(opened.remarks, Kind.WRONG), *calibrated.warnings):
         tell(f"looks wrong: {warning}")
     if opened.is_geotiff:
         tell("note: the maps do not keep the geo-reference of a TIFF; their pixels are those of the file")
-    for note in sentences(opened.remarks, Kind.DONE):
+    for note in (*sentences(opened.remarks, Kind.DONE), *calibrated.notes):
         tell(f"note: {note}")
     if opened.is_srgb:
         tell("the picture is taken as sRGB and brought to linear light")
-    if is_compared and stated_reflectance(opened) is None:
+    if is_compared and not calibrated.is_calibrated and stated_reflectance(opened) is None:
         tell(f"note: the file does not say that it holds reflectance. If it does not, {LIGHT_UNKNOWN}")
     if left_out := opened.shape[2] - num_bands:
-        why = "marked as bad in the file, of a wavelength that is there twice, or measured nowhere"
+        why = "marked as bad in the file, of a wavelength that is there twice, without light, or measured nowhere"
         tell(f"{counted(left_out, 'band')} left out: {why}")
     if not mask.all():
         tell(f"{counted(int((~mask).sum()), 'pixel')} without a measurement in every band left out")
@@ -151,18 +168,3 @@ def _library(options: _ImageOptions, wavelengths: np.ndarray | None) -> Material
         unknown = "its wavelengths are not known, so no spectrum of a library can be compared"
         raise CaptureError(f"{options.file}: {unknown}")
     return library_of(options.library, Bands.of(wavelengths))
-
-
-def _good_bands(opened: Cube) -> tuple[np.ndarray, np.ndarray | None]:
-    """Indices of the bands that the file does not mark as bad, by wavelength where that is known, each wavelength once;
-    and wavelengths."""
-    import numpy as np
-
-    table = opened.bands
-    kept = np.arange(opened.shape[2]) if table.bad is None else np.flatnonzero(~table.bad)
-    if len(kept) == 0:
-        raise CaptureError(f"{opened.path}: the file marks all of its bands as bad")
-    if table.wavelengths_nm is None:
-        return kept, None
-    wavelengths, first = np.unique(table.wavelengths_nm[kept], return_index=True)
-    return kept[first], wavelengths

@@ -13,15 +13,17 @@ from hypothesis import strategies as st
 from tests.captures.file_factory import file_of
 from unmix_plugin.captures.calibration.calibration import Calibration, Raster
 from unmix_plugin.captures.calibration.references import (
+    GivenReferences,
     ReferenceKind,
     SensorReferences,
     ViewReferences,
     find_missing,
+    find_references,
     open_reference,
-    own_dark_mean,
     panel_reference,
 )
-from unmix_plugin.captures.cube import Cube, Linear
+from unmix_plugin.captures.cube import CaptureView, Cube, Linear
+from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.errors import CaptureError, ConfigError
 
@@ -229,9 +231,12 @@ def test_dark_lines_of_raw_numbers_are_a_dark_frame_whatever_they_are_called(nam
     counts = np.full((6, 4, 2), 300, dtype)
     counts[4:] = 90
     file = replace(file_of(counts, **facts), path=Path(f"{name}.hdr"), shape=(4, 4, 2), dark_lines=2)
-    found = own_dark_mean(file)
+    options, view = ProcessOptions("cubes", Path(), Path()), CaptureView("leaf", file)
+    found = (
+        find_references([view], np.array([500.0, 600.0]), options, GivenReferences(), [view]).of(file).dark
+    )
     assert (found is not None) == has_dark
-    assert found is None or (found == 90).all()
+    assert found is None or (found.mean == 90).all()
 
 
 @pytest.mark.parametrize(

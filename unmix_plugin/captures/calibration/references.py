@@ -464,13 +464,6 @@ def _own_dark(file: Cube, beside: Cube | None = None) -> Cube | None:
     return beside or (None if finished_by(file) else file.dark)
 
 
-def own_dark_mean(file: Cube) -> Float32[np.ndarray, "1 W B"] | None:
-    """Mean of the lines of a file that were taken with the shutter closed; None where it has none or its numbers are
-    not raw. Raises CaptureError: a column of them holds no measurement."""
-    dark = _own_dark(file)
-    return None if dark is None else open_reference(dark, ReferenceKind.DARK, file).mean
-
-
 def _one_each(files: Mapping[str, Cube | None], kind: ReferenceKind) -> dict[str, Cube]:
     """A reference for each view, by its name: its own, or the only one that there is. Raises CaptureError: several
     views have different ones, and others none."""

@@ -133,7 +133,7 @@ def write_view(
     """Write cube, picture and mask of a view, its pixels brought into another lens where there is a resampling. Raises
     CaptureError: a file of the view can't be read. Raises RunError: the folder can't be written."""
     raster = recipe.calibration.raster
-    masks, labels = _read_view_masks(view, raster, recipe.use_opacity), _read_labels(view, raster)
+    masks, labels = read_view_masks(view, raster, recipe.use_opacity), _read_labels(view, raster)
     if resampling is not None:
         # A pixel is valid where all are that it is made of.
         valid = resampling.smooth(np.where(masks.valid, np.uint8(OPAQUE), np.uint8(0))) == OPAQUE
@@ -176,7 +176,7 @@ def write_view(
 class _Tally:
     """What is gathered while rows stream by."""
 
-    def __init__(self, height: int, width: int, bands: int, masks: _ViewMasks) -> None:
+    def __init__(self, height: int, width: int, bands: int, masks: ViewMasks) -> None:
         self.rgb: Float32[np.ndarray, "H W 3"] = np.zeros((height, width, 3), np.float32)
         self.brightness: Float32[np.ndarray, "H W"] = np.zeros((height, width), np.float32)
         self.missing: Bool[np.ndarray, "H W"] = ~masks.valid
@@ -323,7 +323,7 @@ def _finest_contrast(picture: Float32[np.ndarray, "H W"], seen: Bool[np.ndarray,
 
 
 @dataclass(frozen=True)
-class _ViewMasks:
+class ViewMasks:
     """Masks of one view on the scene's raster."""
 
     valid: Bool[np.ndarray, "H W"]
@@ -335,7 +335,7 @@ class _ViewMasks:
     multiplied by it. Source: PNG specification, whose colours never are."""
 
 
-def _read_view_masks(view: CaptureView, raster: Raster, use_opacity: bool) -> _ViewMasks:
+def read_view_masks(view: CaptureView, raster: Raster, use_opacity: bool) -> ViewMasks:
     """The masks of a view.
 
     Args:
@@ -359,7 +359,7 @@ def _read_view_masks(view: CaptureView, raster: Raster, use_opacity: bool) -> _V
             opacity = np.where(is_black, 0, OPAQUE).astype(np.uint8)
         else:
             valid = ~is_black
-    return _ViewMasks(valid, opacity, straight)
+    return ViewMasks(valid, opacity, straight)
 
 
 def _read_labels(view: CaptureView, raster: Raster) -> UInt8[np.ndarray, "H W"] | None:
