@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import _common
 import _machine
@@ -58,6 +58,8 @@ class Options:
     """Width and height of every view, pixels."""
     views: int = 24
     """Views of each scene."""
+    seed: int | None = None
+    """Judge rooms, skies, walls and corners that are drawn with this seed instead: nothing was tuned on them."""
     train_steps: int | None = None
     """Train rooms and things before backdrops so long with what is decided, bounded and unbounded; None trains
     nothing."""
@@ -203,6 +205,7 @@ def cases() -> Iterator[Case]:
         for where, cameras in (("dome", demo_cameras), ("ring", _ring)):
             place = Place(THINGS, cameras, _sky(material, level))
             yield Case(f"before {material} {level:g}, {where}", "backdrops", place, found, can_train=True)
+    # At a finite distance: a part of the scene that is learnt like all others.
     standing = {
         "a grey corner": _corner(1.6, "white", "white", "white"),
         "a far grey corner": _corner(3.5, "white", "white", "white"),
@@ -214,7 +217,7 @@ def cases() -> Iterator[Case]:
     }
     for name, things in standing.items():
         place = Place((*THINGS, *things), _before_a_wall, dark)
-        yield Case(f"before {name}", "walls and corners", place, found, can_train=True)
+        yield Case(f"before {name}", "walls and corners", place, no_backdrop, can_train=True)
     for name in ("world", "room"):
         yield Case(f"open {name}", "open places", PLACES[name], {**no_backdrop, "world": "unbounded"})
     table, before = PLACES["table"], Place(THINGS, demo_cameras, _sky("white", 0.2))
@@ -232,6 +235,77 @@ def cases() -> Iterator[Case]:
             truth: Truth = {"poses": (f"look like {convention}", _REFUSED)}  # masks contradict the poses
             name = f"poses {convention}, {place_name}"
             yield Case(name, "wrong conventions", place, truth, _with_other_poses(convention))
+
+
+@dataclass(frozen=True)
+class _DrawnCameras:
+    """Random cameras of one kind, the same at each call."""
+
+    kind: Literal["ring", "dome", "one side", "before a wall"]
+    seed: int
+    away: float
+    angle_deg: float
+
+    def __call__(self, size: int, views: int) -> Cameras:
+        generator = np.random.default_rng(self.seed)
+        if self.kind == "dome":
+            return demo_cameras(size, views, self.angle_deg)
+        if self.kind == "one side":
+            places = np.array([0, -self.away, 1.4]) + generator.uniform(-1, 1, (views, 3)) * (0.9, 0.2, 0.7)
+            targets = np.array([0, 0.3, 0.6]) + generator.uniform(-0.2, 0.2, (views, 3))
+            return _looking(places, targets, size, self.angle_deg)
+        if self.kind == "ring":
+            turns = generator.uniform(0, 6) + np.arange(views) * 2 * np.pi / views
+            height = 1 + generator.uniform(0.1, 0.6) * np.sin(3 * turns)
+            places = np.stack([self.away * np.cos(turns), self.away * np.sin(turns), height], axis=1)
+            return _looking(places, np.array([0, 0, 0.3]), size, self.angle_deg)
+        azimuth = np.deg2rad(-90 + generator.uniform(25, 50) * generator.uniform(-1, 1, views))
+        rise = np.deg2rad(generator.uniform(10, 45, views))
+        flat, middle = np.cos(rise), np.array([0, 0, 0.2])
+        towards = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(rise)], axis=1)
+        return _looking(middle + 4.1 * towards, middle, size, 40.0)
+
+
+def drawn_cases(seed: int) -> Iterator[Case]:
+    """Twelve closed rooms, six skies, six walls and corners of random sizes, colours and cameras."""
+    generator = np.random.default_rng(seed)
+
+    def colours(count: int, most: int) -> list[str]:
+        few = generator.choice(MATERIALS, most, replace=False)
+        return [str(name) for name in generator.choice(few, count)]
+
+    def cameras(kind: Literal["ring", "dome", "one side", "before a wall"]) -> _DrawnCameras:
+        away, angle_deg = generator.uniform((2.2, 42), (3.0, 65))
+        return _DrawnCameras(kind, int(generator.integers(1 << 30)), float(away), float(angle_deg))
+
+    dark, nothing = _sky("white", 0.0), {**_FITS, "backdrop": "none"}
+    kinds: tuple[Literal["ring", "dome", "one side"], ...] = ("ring", "dome", "one side")
+    for number in range(12):
+        kind, materials = kinds[number % 3], colours(4, 1 + number // 3)
+        reach = float(generator.uniform(4.3, 6.0) if kind == "dome" else generator.uniform(3.3, 5.5))
+        place = Place((*THINGS, *_room(reach, *materials)), cameras(kind), dark)
+        yield Case(
+            f"room {number}, {kind}, {reach:.1f}, {', '.join(materials)}",
+            "rooms",
+            place,
+            nothing,
+            can_train=True,
+        )
+    found: Truth = {**_FITS, "backdrop": "found"}
+    for number in range(6):
+        material, level = colours(1, 1)[0], float(generator.uniform(0.05, 0.9))
+        place = Place(THINGS, cameras(kinds[number % 2]), _sky(material, level))
+        yield Case(f"before {material} {level:.2f}", "backdrops", place, found, can_train=True)
+    for number in range(6):
+        away, (floor, left, right) = float(generator.uniform(1.6, 4.0)), colours(3, 1 + number // 2)
+        things = _corner(away, floor, left, right) if number % 2 else _wall(away, floor, left)
+        what = (
+            f"a corner {away:.1f} away, {floor}, {left}, {right}"
+            if number % 2
+            else f"a wall {away:.1f} away, {left}"
+        )
+        place = Place((*THINGS, *things), cameras("before a wall"), dark)
+        yield Case(f"before {what}", "walls and corners", place, nothing, can_train=True)
 
 
 def _floors() -> Iterator[tuple[str, np.ndarray]]:
@@ -310,7 +384,7 @@ def psnr_of(scene: Path, world: str, steps: int) -> float:
 
 def main(options: Options) -> None:
     """Judge and publish."""
-    chosen, floors = list(cases()), list(_floors())
+    chosen, floors = list(cases() if options.seed is None else drawn_cases(options.seed)), list(_floors())
     if options.quick:
         options = replace(options, size=48, views=16)
         chosen, floors = chosen[::10], floors[::4]
@@ -351,7 +425,13 @@ def report(options: Options, count: int, rows: list[dict[str, Any]], lost: dict[
         limit = _common.Limit(0.3, is_upper=True, unit=" dB")
         worst = max(lost, key=lambda name: lost[name])
         figures.append(limit.judge(f"PSNR lost against the best flag, most ({worst})", lost[worst]))
-    setting = {"scenes": count, "size": options.size, "views": options.views, "steps": options.train_steps}
+    setting = {
+        "scenes": count,
+        "size": options.size,
+        "views": options.views,
+        "steps": options.train_steps,
+        "seed": options.seed,
+    }
     other = [list(map(str, row.values())) for row in rows if row["verdict"] != "right"]
     tables = [_common.DetailTable("not right", ["case", "kind", "subject", "outcome", "verdict"], other)]
     if lost:
@@ -360,8 +440,9 @@ def report(options: Options, count: int, rows: list[dict[str, Any]], lost: dict[
     question = "Automatic decisions on scenes of which the truth is known"
     details = {"decisions": rows, "lost_db": lost}
     machine = _machine.describe_machine("cpu")
+    name = "decisions" if options.seed is None else "decisions-drawn"
     _common.publish(
-        _common.Report("decisions", question, setting, machine, figures, details, tuple(tables)),
+        _common.Report(name, question, setting, machine, figures, details, tuple(tables)),
         _common.results_folder(options.results, options.quick),
     )
 

@@ -13,6 +13,7 @@ from tests.captures.file_factory import present
 from tests.scenes.demo.demo_parts import one_ray_a_pixel
 from unmix_plugin.engine.geometry.camera_paths import upright_cameras
 from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.scenes.backdrop_trial import measure_distance
 from unmix_plugin.scenes.backdrops import find_before_backdrop
 from unmix_plugin.scenes.demo.scene import Place, demo_cameras, make_demo_scene
 from unmix_plugin.scenes.demo.shading import MATERIALS, THINGS, Surface, Thing, plain
@@ -98,6 +99,8 @@ ROOMS = {
     "white": (room(3.6, "white", "white", "white", "white"), around_inside),
     "cyan": (room(3.6, "cyan", "cyan", "cyan", "cyan"), around_inside),
     "white between red walls": (room(4.6, "white", "red", "red", "red"), wide_dome),
+    "white, from above": (room(4.4, "white", "white", "white", "white"), demo_cameras),
+    "cyan, from above": (room(4.4, "cyan", "cyan", "cyan", "cyan"), demo_cameras),
     "with coloured sides": (room(3.6, "white", "red", "green", "white"), around_inside),
 }
 
@@ -123,16 +126,48 @@ def test_what_looks_like_a_backdrop_is_tried_against_its_masks(tmp_path, name):
     )  # what the views show behind the box decides, as without anything plain
 
 
+@pytest.mark.parametrize("name", ["white, from above", "cyan, from above"])
+def test_a_room_whose_masks_agree_is_told_by_the_distance_of_its_walls(tmp_path, name):
+    walls, cameras = ROOMS[name]
+    views = training_views(scene_of(tmp_path, walls=walls, cameras=cameras))
+    before = present(find_before_backdrop(views))
+    distance = measure_distance(views, before)
+    assert distance.far > 0.5  # neither directions nor pixels tell what a view shows
+    assert distance.near < 0.7 * distance.far
+
+
+STANDING = {
+    "a red wall": [corner(1, *["white"] * 3)[0], slab((0, 2.1, 3), (12, 0.1, 3.2), "red")],
+    "a grey corner": corner(1.6, "white", "white", "white"),
+    "a corner of three colours": corner(1.6, "white", "cyan", "red"),
+}
+
+
+@pytest.mark.parametrize("name", STANDING)
+def test_walls_behind_things_are_part_of_the_scene(tmp_path, name):
+    scene = scene_of(tmp_path, walls=STANDING[name], cameras=before_a_wall)
+    assert find_before_backdrop(training_views(scene)) is not None  # by looks alone it is one
+    assert not scene.has_backdrop
+    [decision] = [one for one in scene.decisions if one.subject == "backdrop"]
+    assert decision.outcome == "none"
+
+
+def test_where_views_agree_on_no_place_of_a_backdrop_all_is_kept_and_said(tmp_path):
+    """Of a grey sky that some views show brighter."""
+    folder = tmp_path / "scene"
+    scene_of(tmp_path, walls=[], cameras=demo_cameras, sky=sky_of("white", 0.3))
+    for number, path in enumerate(sorted((folder / "cubes").glob("*.npy"))):
+        np.save(path, (np.load(path) * (1.0 - 0.05 * (number % 5))).astype(np.float16))
+    scene = load_scene(folder)
+    [decision] = [one for one in scene.decisions if one.subject == "backdrop"]
+    assert decision.is_undecided
+    assert not scene.has_backdrop
+    assert any("it is kept as part of the scene" in warning for warning in scene.warnings)
+
+
 BEFORE = {
     "black": ([], demo_cameras, sky_of("white", 0.0)),
     "cyan": ([], demo_cameras, sky_of("cyan", 0.6)),
-    "a red wall": (
-        [corner(1, *["white"] * 3)[0], slab((0, 2.1, 3), (12, 0.1, 3.2), "red")],
-        before_a_wall,
-        None,
-    ),
-    "a grey corner": (corner(1.6, "white", "white", "white"), before_a_wall, None),
-    "a corner of three colours": (corner(1.6, "white", "cyan", "red"), before_a_wall, None),
 }
 
 

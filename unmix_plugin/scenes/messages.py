@@ -284,6 +284,10 @@ class Message(Enum):
         "pictures have no alpha, but share a plain backdrop: it is learnt as what lies behind the scene, and nothing "
         "is sought where they show it (--world bounded or unbounded does without)"
     )
+    BACKDROP_IN_DOUBT = (
+        "pictures share what looks like a backdrop, {looks}, but views differ in {share:.0%} of its places: it is kept "
+        "as part of the scene. Give pictures alpha if it is none"
+    )
     BANDS_OF_NO_USE = "{bands} {what}: its errors {why}; leave it out where you can"
     VALUES_REPLACED = (
         "{share:.2g} of all measured values stand out from the bands and pixels around them (stripes, spikes); "

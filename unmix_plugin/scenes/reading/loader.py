@@ -127,7 +127,7 @@ def _assemble(
     root: Path, entry: SceneEntry, checked: CheckedFiles, truth: _Truth, split: Split, options: SceneOptions
 ) -> Scene:
     space = find_model_space(root, entry, checked, split.train, options)
-    before, fwhm_nm, warnings = space.before_backdrop, entry.fwhm_nm, entry.warnings
+    before, fwhm_nm, warnings = space.before_backdrop, entry.fwhm_nm, (*entry.warnings, *space.warnings)
     if fwhm_nm is not None and (unknown := int(np.isnan(fwhm_nm).sum())):
         warning = Message.UNKNOWN_WIDTHS.sentence(unknown=unknown, bands=len(fwhm_nm))
         fwhm_nm, warnings = None, (*warnings, warning)

@@ -14,11 +14,11 @@ from unmix_plugin.engine.decisions import Decision
 from unmix_plugin.engine.geometry.camera_paths import meeting_point
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.errors import SceneError
-from unmix_plugin.scenes.backdrops import BeforeBackdrop, find_before_backdrop
-from unmix_plugin.scenes.doctor import check_masks, check_poses, contradicted_share
+from unmix_plugin.scenes.backdrop_trial import NO_BACKDROP, try_backdrop
+from unmix_plugin.scenes.backdrops import BeforeBackdrop
+from unmix_plugin.scenes.doctor import check_poses
 from unmix_plugin.scenes.folder import CUBE_KEY
 from unmix_plugin.scenes.geometry.bounds import find_bounds
-from unmix_plugin.scenes.geometry.carving import MOST_CONTRADICTED
 from unmix_plugin.scenes.geometry.matched_points import find_matched_points
 from unmix_plugin.scenes.geometry.view_agreement import compare_conventions, find_world_evidence
 from unmix_plugin.scenes.geometry.views import Views, commonest
@@ -69,42 +69,7 @@ class ModelSpace:
     before_backdrop: BeforeBackdrop | None
     world_reason: str | None
     decisions: tuple[Decision, ...]
-
-
-@dataclass(frozen=True)
-class _JudgedBackdrop:
-    """Whether views stand before a backdrop, tried against its masks."""
-
-    before: BeforeBackdrop | None = None
-    box: SceneBox | None = None
-    """Of what stands before it."""
-    decision: Decision | None = None
-    is_refuted: bool = False
-    """Whether there is what looks like one and is none."""
-
-
-_NO_BACKDROP = _JudgedBackdrop()
-
-
-def _judge_backdrop(views: Views) -> _JudgedBackdrop:
-    """Look for a backdrop that the views share, and try it.
-
-    Plain walls of a room share much with a backdrop, but stand at a finite distance among what they are behind: masks
-    cut from them contradict each other between views, as other views see a wall where one sees only background.
-    """
-    before = find_before_backdrop(views)
-    if before is None:
-        return _JudgedBackdrop(decision=Decision("backdrop", "none", {}, "", "--world"))
-    box, contradicted = None, 0.0
-    if before.shows_matter:
-        box, contradicted = contradicted_share(views.cameras, before.masks())
-    tried = f"masks from it contradict each other behind more than {MOST_CONTRADICTED:.0%} of what they show"
-    is_refuted = check_masks(contradicted) is not None
-    evidence = {"looks": before.in_words, "contradicted": contradicted}
-    decision = Decision("backdrop", "none" if is_refuted else "found", evidence, tried, "--world")
-    if is_refuted:
-        return _JudgedBackdrop(decision=decision, is_refuted=True)
-    return _JudgedBackdrop(before, box, decision=decision)
+    warnings: tuple[str, ...]
 
 
 def find_model_space(
@@ -134,7 +99,7 @@ def find_model_space(
     compared = Views(cameras[alike], read_view, read_valid)
     box = points = None
     looked_for = foreground is None and options.world == "auto" and len(alike) == len(train)
-    backdrop = _judge_backdrop(compared) if looked_for else _NO_BACKDROP
+    backdrop = try_backdrop(compared) if looked_for else NO_BACKDROP
     before, box = backdrop.before, backdrop.box
     has_masks = box is not None or foreground is not None
     if not has_masks and meeting_point(cameras.camera_to_world.double().numpy()) is None:
@@ -160,4 +125,6 @@ def find_model_space(
     translation = first.translation - 0.5 * (low + high) / first.scale
     normalisation = Normalisation(first.rotation, translation, first.scale * scale)
     own_box = SceneBox(torch.from_numpy(np.stack([-half, half])).float())
-    return ModelSpace(normalisation, own_box, is_unbounded, before, reason, tuple(decisions))
+    return ModelSpace(
+        normalisation, own_box, is_unbounded, before, reason, tuple(decisions), backdrop.warnings
+    )
