@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from unmix_plugin.engine.processes import Processes
     from unmix_plugin.engine.training.trainer import Trainer
+    from unmix_plugin.scenes.scene import Scene
     from unmix_plugin.trained.protocol import RenderableScene
 
 
@@ -184,11 +185,34 @@ def finish(trainer: Trainer, console: Console) -> None:
         say(console, f"warning: {skipped}: loss or gradients were not finite, see {trainer.run.log_path}")
     _write_results(trainer)
     data = trainer.pipeline.datamanager
-    if spectral_scene(data) is not None:  # remarks name settings of spectral methods
+    scene = spectral_scene(data)
+    if scene is not None:  # remarks name settings of spectral methods
+        _compare_views(trainer, scene, console)
         num_pixels = int(data.metadata().get("num_train_pixels", 0))
         few = _remark_on_passes(record.total_rays, num_pixels)
         for remark in [*_remarks(trainer.run.metrics_path), *few]:
             say(console, remark)
+
+
+def _compare_views(trainer: Trainer, scene: Scene, console: Console) -> None:
+    """Say, here and in run.log, which training views do not fit the others."""
+    from unmix_plugin.commands.reporting import say, working
+    from unmix_plugin.engine.runs.load_run import read_scene_record
+    from unmix_plugin.engine.training.progress import write_event
+    from unmix_plugin.trained.open_run import snapshot
+    from unmix_plugin.trained.trained_scene import TrainedScene
+    from unmix_plugin.trained.view_fit import describe_misfits, fit_views, write_fits
+
+    averages = None if trainer.average is None else trainer.average.values
+    with trainer.control.device.training_turn(), working(console, "comparing training views"):
+        record = read_scene_record(trainer.run)
+        trained = snapshot(trainer.pipeline.model, trainer.config.method_name, record, averages)
+        if not isinstance(trained, TrainedScene):
+            return
+        found = write_fits(trainer.run.path, fit_views(trained, scene))
+    for remark in describe_misfits(found):
+        say(console, f"warning: {remark}")
+        write_event(trainer.run, remark)
 
 
 def _write_results(trainer: Trainer) -> None:

@@ -1,0 +1,204 @@
+"""Which training views do not fit what all of them together were trained to, and why: pose, exposure or blur.
+
+A view with another view's pose, another exposure or a blur can't be explained by a scene that explains the others:
+its error stands out. What is wrong with it is what makes the error smaller: one factor, an exposure; a shift of the
+picture, a pose. Where fine structures are missing it is blurred; an error all over the view that nothing explains is a
+pose, too.
+
+Notation: `h x w` pixels of a view thinned out, `B` bands.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from enum import Enum, unique
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64
+
+from unmix_plugin.engine.runs.atomic_files import read_run_json, write_run_json
+from unmix_plugin.rendering.front_to_back import composite
+from unmix_plugin.scenes.scene import Scene
+from unmix_plugin.trained.run_views import RunView, views_of
+from unmix_plugin.trained.trained_scene import TrainedScene
+
+FILE_NAME = "training_views.json"
+"""In the folder of a run."""
+_LONGEST_SIDE_PX = 64
+"""Of what is rendered of a view."""
+_FEWEST_VIEWS, _FEWEST_PIXELS = 6, 50
+_TIMES_USUAL, _LEAST_ERROR = 2.0, 0.05
+"""Error of a view over the median of all from which it stands out, if it is so much of its brightness at all."""
+_MOST = 0.25
+"""Share of the views that may stand out; more are the capture as it is."""
+_EXPLAINS = 0.7
+"""Of the error, what is left where a cause explains it."""
+_LEAST_FACTOR = float(np.log(1.15))
+_FURTHEST_SHIFT = 4
+"""Pixels of the thinned-out view."""
+_BLURRED, _TIMES_USUAL_BLURRED = 0.6, 1.3
+"""Fine contrast of a view over what is rendered of it, relative to the other views, and the error that stands out then:
+a blur takes little of the brightness."""
+_ALL_OVER = 0.4
+"""Share of the pixels in which the error is above the usual one, of a pose that is wrong."""
+
+
+@unique
+class Misfit(Enum):
+    """What is wrong with a view."""
+
+    EXPOSURE = "exposure"
+    POSE = "pose"
+    BLUR = "blur"
+    CONTENT = "it shows something that the others do not"
+
+
+@dataclass(frozen=True)
+class ViewFit:
+    """A training view beside what is rendered of it."""
+
+    name: str
+    error: float
+    """Root mean square over pixels and bands, as a share of what was measured."""
+    factor: float
+    """Measured over rendered, least squares."""
+    error_of_factor: float
+    """Error left with it."""
+    error_of_shift: float
+    """Error left with the best shift of the picture by whole pixels."""
+    sharpness: float
+    """Fine contrast measured over that rendered."""
+    spread: float
+    """Share of the pixels whose error is at least half of the root mean square."""
+
+
+@torch.no_grad()
+def fit_views(trained: TrainedScene, scene: Scene) -> list[ViewFit]:
+    """Compare the training views with all bands with what is rendered of them; reads their cubes."""
+    found = []
+    for row, (index, view) in enumerate(
+        zip(scene.train_indices, views_of(trained.views, "train"), strict=True)
+    ):
+        if scene.sensor_of(index).sees_all_bands:
+            gains = None if trained.view_gains is None else trained.view_gains[row].double().numpy()
+            fit = _fit(trained, scene, index, view, gains)
+            found += [] if fit is None else [fit]
+    return found
+
+
+def _fit(
+    trained: TrainedScene, scene: Scene, index: int, view: RunView, gains: Float64[np.ndarray, " B"] | None
+) -> ViewFit | None:
+    stride = -(-max(view.camera.size(0)) // _LONGEST_SIDE_PX)
+    every = slice(stride // 2, None, stride)
+    measured = scene.cube(index, (every, every)).astype(np.float64)
+    height, width = measured.shape[:2]
+    counts = scene.valid_mask(index, (every, every))
+    alpha = scene.alpha(index)
+    counts = counts if alpha is None else counts & (alpha[every, every] > 0.5)
+    if counts.sum() < _FEWEST_PIXELS:
+        return None
+    rows, columns = np.mgrid[:height, :width] * stride + stride // 2 + 0.5
+    coords = torch.from_numpy(np.stack([columns.ravel(), rows.ravel()], axis=1)).float()
+    rays = view.camera.generate_rays(torch.zeros(len(coords), dtype=torch.int64), coords)
+    seen = composite(trained.renderer, trained.field, rays.to(trained.device))
+    rendered = trained.materials.spectra(seen).cpu().double().numpy().reshape(measured.shape)
+    rendered = rendered if gains is None else rendered * gains
+    scale = float(np.sqrt(np.mean(measured[counts] ** 2)))
+    if not scale > 0:
+        return None
+    own, other = measured[counts], rendered[counts]
+    factor = float((own * other).sum() / max(float((other**2).sum()), 1e-12))
+    away = np.sqrt(np.mean((own - other) ** 2, axis=1)) / scale
+    error = float(np.sqrt(np.mean(away**2)))
+    grey, shown = measured.mean(axis=2), rendered.mean(axis=2)
+    contrast = [_fine_contrast(picture, counts) for picture in (grey, shown)]
+    of_grey = float(np.sqrt(np.mean((grey - shown)[counts] ** 2)))
+    return ViewFit(
+        name=view.name,
+        error=error,
+        factor=factor,
+        error_of_factor=float(np.sqrt(np.mean((own - factor * other) ** 2))) / scale,
+        error_of_shift=error * _best_shift(grey, shown, counts) / max(of_grey, 1e-12),
+        sharpness=contrast[0] / max(contrast[1], 1e-12),
+        spread=float((away > 0.5 * error).mean()),
+    )
+
+
+def _fine_contrast(picture: Float64[np.ndarray, "h w"], counts: Bool[np.ndarray, "h w"]) -> float:
+    """Root mean square of second differences along rows and columns."""
+    squares = []
+    for image, known in ((picture, counts), (picture.T, counts.T)):
+        inside = known[:, :-2] & known[:, 1:-1] & known[:, 2:]
+        squares.append(((image[:, :-2] - 2 * image[:, 1:-1] + image[:, 2:])[inside]) ** 2)
+    return float(np.sqrt(np.mean(np.concatenate(squares)))) if sum(map(len, squares)) else 0.0
+
+
+def _best_shift(
+    measured: Float64[np.ndarray, "h w"],
+    rendered: Float64[np.ndarray, "h w"],
+    counts: Bool[np.ndarray, "h w"],
+) -> float:
+    """Least root mean square difference over shifts of what is rendered by whole pixels."""
+    most = min(_FURTHEST_SHIFT, (min(measured.shape) - 1) // 4)
+    inner = np.s_[most : measured.shape[0] - most, most : measured.shape[1] - most]
+    kept, found = counts[inner], []
+    for down in range(-most, most + 1):
+        for across in range(-most, most + 1):
+            moved = np.roll(rendered, (down, across), axis=(0, 1))
+            found.append(float(np.mean((measured - moved)[inner][kept] ** 2)) if kept.any() else np.inf)
+    return float(np.sqrt(min(found)))
+
+
+def misfits(fits: Sequence[ViewFit]) -> dict[str, Misfit]:
+    """Views that do not fit the others, and why; none where many do not."""
+    if len(fits) < _FEWEST_VIEWS:
+        return {}
+    usual = float(np.median([fit.error for fit in fits]))
+    sharpness = float(np.median([fit.sharpness for fit in fits]))
+    outlying = []
+    for fit in fits:
+        times = _TIMES_USUAL_BLURRED if fit.sharpness < _BLURRED * sharpness else _TIMES_USUAL
+        if fit.error > max(times * usual, _LEAST_ERROR):
+            outlying.append(fit)
+    if len(outlying) > _MOST * len(fits):
+        return {}
+    return {fit.name: _reason(fit, sharpness) for fit in outlying}
+
+
+def _reason(fit: ViewFit, sharpness: float) -> Misfit:
+    if abs(np.log(max(fit.factor, 1e-6))) > _LEAST_FACTOR and fit.error_of_factor < _EXPLAINS * fit.error:
+        return Misfit.EXPOSURE
+    if fit.sharpness < _BLURRED * sharpness:
+        return Misfit.BLUR
+    if fit.error_of_shift < _EXPLAINS * fit.error or fit.spread > _ALL_OVER:
+        return Misfit.POSE
+    return Misfit.CONTENT
+
+
+def describe_misfits(found: dict[str, Misfit]) -> list[str]:
+    """A sentence a view."""
+    advice = "leave it out with --leave-out of unmix-process, or mend it"
+    return [
+        f"{name} does not fit the other views: {reason.value}; {advice}" for name, reason in found.items()
+    ]
+
+
+def write_fits(run: Path, fits: Sequence[ViewFit]) -> dict[str, Misfit]:
+    """Write how views fit into the folder of a run; gives those that do not."""
+    found = misfits(fits)
+    views = [{**asdict(fit), "misfit": found[fit.name].name if fit.name in found else None} for fit in fits]
+    write_run_json(run / FILE_NAME, {"views": views})
+    return found
+
+
+def read_misfits(run: Path) -> dict[str, Misfit]:
+    """The views of a run that do not fit, as they were written; empty where nothing was."""
+    path = run / FILE_NAME
+    if not path.is_file():
+        return {}
+    views = read_run_json(path)["views"]
+    return {view["name"]: Misfit[view["misfit"]] for view in views if view["misfit"] is not None}
