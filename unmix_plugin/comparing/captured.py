@@ -195,7 +195,11 @@ class Capture:
         near = excess.abs() <= _SAME_SURFACE_PX / cosines[:, None]
         is_seen = (near & torch.from_numpy(solid).flatten()[corners]).all(dim=1)
         spectra, specular = (
-            np.einsum("nc,ncx->nx", weights.numpy(), values.reshape(-1, values.shape[-1])[corners.numpy()])
+            np.einsum(
+                "nc,ncx->nx",
+                weights.numpy(),
+                values.reshape(height * width, values.shape[-1])[corners.numpy()],
+            )
             for values in (measured, found.specular.cpu().numpy())
         )
         # What is hidden behind something else says nothing of the place; where the ray goes on, matter is gone.

@@ -17,11 +17,11 @@ from unmix_plugin.comparing.captured import Surface
 from unmix_plugin.comparing.significance import Difference, adjusted, is_significant
 from unmix_plugin.spectral.metrics import spectral_angle
 
-_GROWING_P = 0.02
+_GROWING_P = 0.05
 """p of a neighbour up to which a place goes on."""
-_SMALLEST_PX, _SMALLEST_BY_DISTANCE_PX = 4.0, 50.0
+_SMALLEST_PX, _SMALLEST_BY_DISTANCE_PX = 4.0, 100.0
 """Area in pixels below which a place is not told from noise at an edge; and of one that is known by distance alone, as
-distances are averaged over about so much."""
+errors of distances reach about so far."""
 _LARGEST_HOLE_PX = 30.0
 """Area of what lies within a place and belongs to it."""
 _CONFIDENCE = 0.95
@@ -87,8 +87,9 @@ def find_places(
     )
     changed = np.zeros(len(p), bool)
     for vertices in _pieces(surface, grown):
-        least = _SMALLEST_PX if by_spectra[vertices].any() else _SMALLEST_BY_DISTANCE_PX
-        if seeds[vertices].any() and surface.areas[vertices].sum() >= least * pixel**2:
+        areas = surface.areas[vertices] / pixel**2
+        is_seen = areas[by_spectra[vertices]].sum() >= _SMALLEST_PX
+        if seeds[vertices].any() and (is_seen or areas.sum() >= _SMALLEST_BY_DISTANCE_PX):
             changed[vertices] = True
     for hole in _pieces(surface, ~changed):
         if surface.areas[hole].sum() <= _LARGEST_HOLE_PX * pixel**2:

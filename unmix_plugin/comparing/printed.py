@@ -39,7 +39,7 @@ def _first_page(comparison: Comparison):  # noqa: ANN202 - a figure of matplotli
     figure, page = page_in_inches(_WIDTH, _HEIGHT)
     top = _HEIGHT - _MARGIN
 
-    def line(text: str, size: float = 9.0, left: float = 0.0, **looks: object) -> None:
+    def line(text: str, size: float | int = 9.0, left: float = 0.0, **looks: object) -> None:
         page.text(_MARGIN + left, top, plot_text(text), fontsize=size, va="top", **looks)
 
     line(f"What has changed: {comparison.before.name}, {comparison.after.name}", 15, fontweight="bold")
