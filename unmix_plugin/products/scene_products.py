@@ -115,8 +115,8 @@ class PointCloud(Product):
 
 @dataclass(frozen=True)
 class Poses(Product):
-    """Cameras of all views as transforms.json, in the world of the scene's poses; those of training views as training
-    corrected them, where it did."""
+    """Cameras of all views as transforms.json and as a COLMAP model, with their pictures, in the world of the scene's
+    poses; those of training views as training corrected them, where it did."""
 
 
 @dataclass(frozen=True)
