@@ -15,11 +15,12 @@ BENCHMARKS := $(filter-out $(patsubst %,benchmarks/%.py,scenes fuzz_guided equal
 MINIMUM := .venv-minimum
 MINIMUM_TESTS := tests/engine tests/spectral tests/editing tests/formats tests/scenes tests/figures tests/viewer/test_server.py tests/captures/readers
 
-.PHONY: results-check results-table scenes demo test cases test-random test-all test-minimum test-portable wheel platforms audit lint format bench notebooks site clean help
+.PHONY: coverage results-check results-table scenes demo test cases test-random test-all test-minimum test-portable wheel platforms audit lint format bench notebooks site clean help
 
 help:
 	@echo "make demo    train on the built-in scene, evaluate, export abundance maps and a page to share"
 	@echo "make test    run the tests, less the slow ones"
+	@echo "make coverage   run the same tests, and say which lines of the package they reach"
 	@echo "make cases   run those of the tests that read files as other people's programs write them"
 	@echo "make test-random   run the property tests on cases that are drawn anew"
 	@echo "make test-all   run every test, and check each shape annotation while they run"
@@ -62,6 +63,11 @@ $(VENV)/.system-packages: scripts/install_system_packages.sh | $(BIN)/python
 
 test: $(VENV)/.installed-dev $(VENV)/.system-packages
 	$(BIN)/python -m pytest --numprocesses 2 -m "not slow"
+
+# As `make test`, and how many lines of the package the tests reach; kernels, which run elsewhere, count as not reached.
+coverage: $(VENV)/.installed-dev $(VENV)/.system-packages
+	$(INSTALL) pytest-cov
+	$(BIN)/python -m pytest --numprocesses 2 -m "not slow" --cov unmix_plugin --cov-report term:skip-covered
 
 # A part of `make test`, in less than a minute.
 cases: $(VENV)/.installed-dev

@@ -2,6 +2,7 @@
 
     python benchmarks/unmixing_2d.py FILE.mat --endmembers 3 --seeds 5 [--json]
     python benchmarks/unmixing_2d.py SCENE_FOLDER [--seeds 5] [--json]
+    python benchmarks/unmixing_2d.py samson_dataset.mat --results benchmarks/results --variant samson
 
 A .mat file holds `Y` (B, N) or (H, W, B), the pixels, `A` (K, N), their true abundances, and `M` (B, K), the true
 endmembers, any of them transposed. Y may be in any unit, M of any brightness. All methods get the same draws, pixels
@@ -21,7 +22,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
-import _common  # noqa: F401 - settles how threads wait, which must be before torch is imported
+import _common  # settles how threads wait, which must be before torch is imported
+import _machine
 import tyro
 from _unmixing_mat import PixelImage, read_mat
 from _unmixing_methods import METHODS, OURS, PixelMethod
@@ -29,6 +31,12 @@ from rich.console import Console
 from rich.table import Table
 
 from unmix_plugin.errors import SceneError, SpectrumError, UnmixError
+
+LIMITS = {
+    "abundance_rmse": _common.Limit(0.03, is_upper=True),
+    "endmember_angle": _common.Limit(0.035, is_upper=True, unit=" rad"),
+}
+"""Of the product's own method, on Samson."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +53,10 @@ class Options:
     """Names of methods; all if none is given."""
     json: bool = False
     """Print JSON."""
+    results: Path | None = None
+    """Folder for unmixing_2d-VARIANT.json and .md; None: nothing is written."""
+    variant: str = ""
+    """What names the files; the file's own name if none is given."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +87,9 @@ def main(options: Options) -> None:
         }
         print(json.dumps(report, indent=1))
         return
+    if options.results is not None:
+        _common.publish(_report(options, methods), options.results)
+        return
     headers = ["method"]
     for key in next(iter(methods.values())):
         headers += [f"{key}: median", "spread", "std"]
@@ -83,6 +98,35 @@ def main(options: Options) -> None:
         cells = [(s.median, s.spread, s.standard_deviation) for s in figures.values()]
         table.add_row(name, *(f"{value:.4f}" for cell in cells for value in cell))
     Console().print(table)
+
+
+def _report(options: Options, methods: dict[str, dict[str, Summary]]) -> _common.Report:
+    """What is written: figures of the product's own method, and a table of all."""
+    own = methods.get(OURS, {})
+    figures = [
+        LIMITS[key].judge(f"{OURS}: {key.replace('_', ' ')}, median", own[key].median)
+        if key in LIMITS
+        else _common.reported(f"{OURS}: {key.replace('_', ' ')}, median", f"{own[key].median:.4f}")
+        for key in own
+    ]
+    keys = list(next(iter(methods.values())))
+    headers = ["method", *(word for key in keys for word in (key.replace("_", " "), "spread", "std"))]
+    rows = [
+        [name, *(f"{v:.4f}" for s in found.values() for v in (s.median, s.spread, s.standard_deviation))]
+        for name, found in methods.items()
+    ]
+    setting = {
+        "file": options.file.name,
+        "seeds": options.seeds,
+        "spread": "largest less smallest over seeds",
+    }
+    measured = {
+        name: {key: asdict(summary) for key, summary in found.items()} for name, found in methods.items()
+    }
+    table = _common.DetailTable("Medians over seeds", headers, rows)
+    question = "Single pixels of an image with known abundances; angles in radians"
+    machine, variant = _machine.describe_machine(), options.variant or options.file.stem
+    return _common.Report("unmixing_2d", question, setting, machine, figures, measured, (table,), variant)
 
 
 def measure(options: Options) -> dict[str, dict[str, Summary]]:
