@@ -14,10 +14,9 @@ from __future__ import annotations
 import io
 import math
 import re
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
-from functools import partial
-from typing import Any, Literal, TypeAlias
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 from xml.etree import ElementTree
 
 import numpy as np
@@ -28,8 +27,6 @@ from unmix_plugin.captures.wavelengths import PLUS_MINUS
 from unmix_plugin.errors import CaptureError, counted
 from unmix_plugin.limits import DEEPEST
 
-FactorOf: TypeAlias = Callable[[Int[np.ndarray, "h 1"], Int[np.ndarray, "1 W"]], Float64[np.ndarray, "h W"]]
-"""Factor at rows y and columns x."""
 _RDF = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}"
 _EXIF_CODE, _BLACK_LEVEL_CODE, _XMP_CODE = 34665, 50714, 700
 _EXIF_OF_PAGE = ("Make", "Model", "Software", "Orientation", "BitsPerSample", "BlackLevel", "DateTime")
@@ -189,6 +186,49 @@ def with_camera_tags(table: BandTable, tags: XmpTags, num_bands: int) -> BandTab
 
 
 @dataclass(frozen=True)
+class _RadialVignetting:
+    """1 + k0 r + k1 r^2 + ... at a distance of r pixels from a centre."""
+
+    coefficients: tuple[float, ...]
+    centre: tuple[float, float]
+    """x and y."""
+
+    def at(self, y: np.ndarray, x: np.ndarray) -> Float64[np.ndarray, "h W"]:
+        """Its value at rows y and columns x."""
+        radius = np.hypot(x - self.centre[0], y - self.centre[1])
+        return np.polynomial.polynomial.polyval(radius, np.array([1.0, *self.coefficients]))
+
+
+@dataclass(frozen=True)
+class _PlaneVignetting:
+    """A polynomial in x / W and y / H."""
+
+    coefficients: Float64[np.ndarray, "n m"]
+    """Of (x / W)^n (y / H)^m."""
+    height: int
+    width: int
+
+    def at(self, y: np.ndarray, x: np.ndarray) -> Float64[np.ndarray, "h W"]:
+        """Its value at rows y and columns x."""
+        across = np.vander(x[0] / self.width, self.coefficients.shape[0], increasing=True)
+        down = np.vander(y[:, 0] / self.height, self.coefficients.shape[1], increasing=True)
+        return down @ self.coefficients.T @ across.T
+
+
+@dataclass(frozen=True)
+class _RowGain:
+    """1 + a2 y / exposure - a3 y, of sensors that read one row after the other."""
+
+    a2: float
+    a3: float
+    exposure_s: float
+
+    def at(self, y: Int[np.ndarray, "h 1"]) -> Float64[np.ndarray, "h 1"]:
+        """Its value at rows y."""
+        return 1.0 + self.a2 * y / self.exposure_s - self.a3 * y
+
+
+@dataclass(frozen=True)
 class _RadiometricModel:
     """How the stored numbers of one file become radiance."""
 
@@ -200,9 +240,21 @@ class _RadiometricModel:
     """Stored number of no light."""
     saturated: float
     """Stored numbers from here on are saturated."""
-    factor_of: FactorOf = field(repr=False)
+    gain: float
+    """For exposure and sensitivity."""
+    vignetting: _RadialVignetting | _PlaneVignetting
+    divides: bool
+    """Whether the vignetting, and the row, divide; they multiply otherwise."""
+    row: _RowGain | None = None
     irradiance: float | None = None
     """What the sunshine sensor measured, as the file gives it; not used."""
+
+    def factor_of(self, y: Int[np.ndarray, "h 1"], x: Int[np.ndarray, "1 W"]) -> Float64[np.ndarray, "h W"]:
+        """Factor at rows y and columns x."""
+        vignetting = self.vignetting.at(y, x)
+        if self.row is not None:
+            vignetting = vignetting * self.row.at(y)
+        return self.gain / vignetting if self.divides else self.gain * vignetting
 
     @property
     def description(self) -> str:
@@ -256,20 +308,22 @@ def _micasense(file: Cube, tags: XmpTags, exif: Mapping[str, Any]) -> _Radiometr
     else:
         centre = _xmp(file, tags, 2, "VignettingCenter")
         polynomial = _xmp(file, tags, 6, "VignettingPolynomial")
-        vignetting = partial(_radial_polynomial, polynomial, centre)
+        vignetting = _RadialVignetting(tuple(polynomial), (centre[0], centre[1]))
 
     irradiance = tag_numbers(tags, "HorizontalIrradiance", "SpectralIrradiance")
     to_si = tag_numbers(tags, "IrradianceScaleToSIUnits")
     default = [0.01 if tag_numbers(tags, "HorizontalIrradiance") else 1.0]
     measured = None if irradiance is None else irradiance[0] * (to_si or default)[0]
-    black = float(np.mean(levels))
     return _RadiometricModel(
-        "MicaSense",
-        "W/m2/sr/nm",
-        black,
-        _SATURATED_12_BITS,
-        lambda y, x: gain / (vignetting(y, x) * (1.0 + a2 * y / exposure - a3 * y)),
-        measured,
+        maker="MicaSense",
+        unit="W/m2/sr/nm",
+        black_level=float(np.mean(levels)),
+        saturated=_SATURATED_12_BITS,
+        gain=gain,
+        vignetting=vignetting,
+        divides=True,
+        row=_RowGain(a2, a3, exposure),
+        irradiance=measured,
     )
 
 
@@ -289,13 +343,18 @@ def _sequoia(file: Cube, tags: XmpTags, exif: Mapping[str, Any]) -> _Radiometric
     saturated = _SATURATED_10_BITS if _stored_range(exif) == 2.0**10 else _SATURATED_10_BITS_OF_16
     # A black level that no number of 10 bits reaches is of the 16 bits that cameras fill otherwise.
     unit = 2.0**6 if saturated == _SATURATED_10_BITS < b else 1.0
-    black = b / unit
     return _RadiometricModel(
-        "Parrot Sequoia", "relative", black, saturated, lambda y, x: unit * gain / vignetting(y, x)
+        maker="Parrot Sequoia",
+        unit="relative",
+        black_level=b / unit,
+        saturated=saturated,
+        gain=unit * gain,
+        vignetting=vignetting,
+        divides=True,
     )
 
 
-def _vignetting_2d(file: Cube, tags: XmpTags) -> FactorOf:
+def _vignetting_2d(file: Cube, tags: XmpTags) -> _PlaneVignetting:
     """A polynomial in x / W and y / H, whose powers the file lists; 1 where there is none."""
     height, width = file.shape[:2]
     powers = [int(power) for power in tag_numbers(tags, "VignettingPolynomial2DName") or ()]
@@ -311,12 +370,7 @@ def _vignetting_2d(file: Cube, tags: XmpTags) -> FactorOf:
         numbers = _xmp(file, tags, len(powers) // 2, "VignettingPolynomial2D")
         np.add.at(coefficients, (powers[::2], powers[1::2]), numbers)
 
-    def vignetting(y: np.ndarray, x: np.ndarray) -> np.ndarray:
-        across = np.vander(x[0] / width, coefficients.shape[0], increasing=True)
-        down = np.vander(y[:, 0] / height, coefficients.shape[1], increasing=True)
-        return down @ coefficients.T @ across.T
-
-    return vignetting
+    return _PlaneVignetting(coefficients, height, width)
 
 
 def _dji(file: Cube, tags: XmpTags, exif: Mapping[str, Any]) -> _RadiometricModel:
@@ -341,10 +395,15 @@ def _dji(file: Cube, tags: XmpTags, exif: Mapping[str, Any]) -> _RadiometricMode
     scale = adjustment[0] / (gain * 1e-6 * microseconds) / _stored_range(exif)
 
     irradiance = tag_numbers(tags, "drone-dji:Irradiance")
-    measured, black = irradiance[0] if irradiance else None, float(np.mean(levels))
-    vignetting = partial(_radial_polynomial, polynomial, centre)
     return _RadiometricModel(
-        "DJI", "relative", black, _SATURATED_12_BITS, lambda y, x: scale * vignetting(y, x), measured
+        maker="DJI",
+        unit="relative",
+        black_level=float(np.mean(levels)),
+        saturated=_SATURATED_12_BITS,
+        gain=scale,
+        vignetting=_RadialVignetting(tuple(polynomial), (centre[0], centre[1])),
+        divides=False,
+        irradiance=irradiance[0] if irradiance else None,
     )
 
 
@@ -379,11 +438,3 @@ def _exif(file: Cube, exif: Mapping[str, Any], *names: str) -> float:
 def _stored_range(exif: Mapping[str, Any]) -> float:
     """Stored numbers go up to this, less one."""
     return 2.0 ** min(32.0, exif_number(exif, "BitsPerSample") or 16.0)
-
-
-def _radial_polynomial(
-    coefficients: list[float], centre: list[float], y: np.ndarray, x: np.ndarray
-) -> Float64[np.ndarray, "h W"]:
-    """1 + k0 r + k1 r^2 + ... at a distance of r pixels from a centre (x, y)."""
-    radius = np.hypot(x - centre[0], y - centre[1])
-    return np.polynomial.polynomial.polyval(radius, np.array([1.0, *coefficients]))

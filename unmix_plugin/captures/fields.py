@@ -195,7 +195,15 @@ def state_bands(entries: Mapping[str, Any], where: str) -> StatedBands:
     good = find(GOOD, "")[1]
     marks = good and [int(mark) if isinstance(mark, bool) else mark for mark in good]
     names, where = find(NAMES, "", separators=",")[1], f"{where} '{named.get(name)}'"
-    return StatedBands(where, centres, unit_of(name), fwhm, unit_of(width, is_of_all=False), marks, names)
+    return StatedBands(
+        where,
+        centres=centres,
+        unit=unit_of(name),
+        fwhm=fwhm,
+        fwhm_unit=unit_of(width, is_of_all=False),
+        good=marks,
+        names=names,
+    )
 
 
 def _unit_in(name: str) -> str:
@@ -217,6 +225,7 @@ def state_linear(
     path: Path,
     num_bands: int,
     entries: Mapping[str, Any],
+    *,
     where: str,
     format_of: Format,
     remarks: list[Remark],

@@ -219,7 +219,7 @@ def make_plan(
     for name, same in by_sensor.items():
         # Views of several sizes are several sensors, and one may show the panel of all.
         every = [v for v in capture.views if v.sensor == name or not (name and v.release)]
-        sensors[name] = plan_sensor(same, options, given, every, cameras)
+        sensors[name] = plan_sensor(same, options, given, all_views=every, cameras=cameras)
     sensors = with_one_exposure(sensors, {name: same[0].cube for name, same in by_sensor.items()})
     left_out = {name: remark for sensor in sensors.values() for name, remark in sensor.left_out.items()}
     sound = {name: [view for view in same if view.name not in left_out] for name, same in by_sensor.items()}
@@ -257,12 +257,12 @@ def make_plan(
     texts = (options.wavelengths or "", options.white_reflectance)  # numbers, or the name of a table
     tables = filter(os.path.isfile, texts)
     return Plan(
-        capture,
-        tuple(views),
-        sensors,
-        recipes,
-        scale,
-        mask,
+        capture=capture,
+        views=tuple(views),
+        sensors=sensors,
+        recipes=recipes,
+        scale=scale,
+        mask=mask,
         remarks=(
             *(Remark.of(Code.NOTE, text=text) for text in capture.notes),
             *(Remark.of(Code.CAPTURE_WARNING, text=text) for text in capture.warnings),
@@ -306,7 +306,7 @@ def plan_sensor(
     first, binning = files[0], options.bin_bands
     model = radiometric_model(first)
     bands = stated_bands(files, options)
-    references = find_references(views, bands.wavelengths_nm, options, given, all_views)
+    references = find_references(views, bands.wavelengths_nm, options, given=given, all_views=all_views)
     if options.saturation is not None:
         saturation = Saturation(options.saturation, "given with --saturation")
     elif model is not None:
@@ -323,7 +323,13 @@ def plan_sensor(
         compared = compare_exposures(_exposed_files(files, references))
 
     raster = Raster.of(first.shape[0], first.shape[1], options.crop, options.bin_pixels)
-    calibration = Calibration(raster, bands.kept, 1, references, saturation.stored, compared.common)
+    calibration = Calibration(
+        raster,
+        bands.kept,
+        references=references,
+        saturation=saturation.stored,
+        exposure=compared.common,
+    )
     drawn = draw_pixels(views, calibration)
     spoilt = judge_values(drawn, cameras)
     left_out = {name: remark for name, remark in spoilt.items() if name not in options.keep_view}
@@ -339,11 +345,11 @@ def plan_sensor(
     models = {view.name: radiometric_model(view.cube) for view in views}
     light = {name: own.irradiance for name, own in models.items() if own and own.irradiance is not None}
     return SensorPlan(
-        replace(calibration, bands=bands.kept, bin_bands=binning),
-        bands,
-        saturation,
-        find_meaning(files, bool(references.whites)),
-        values[:, still_kept].reshape(len(values), -1, binning).mean(axis=2),
+        calibration=replace(calibration, bands=bands.kept, bin_bands=binning),
+        bands=bands,
+        saturation=saturation,
+        meaning=find_meaning(files, bool(references.whites)),
+        sample=values[:, still_kept].reshape(len(values), -1, binning).mean(axis=2),
         is_usual=usual_pixels(pixels.views, still_kept),
         saturated_from=float(np.percentile(at_end, _FEW_PERCENTILE)) if len(at_end) else np.inf,
         lamp=_lamp_of(references, bands, binning),

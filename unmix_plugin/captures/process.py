@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import os
-import re
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -26,7 +23,6 @@ from unmix_plugin.captures.layouts.masks import with_mask_files
 from unmix_plugin.captures.match_checks import views_of_other_poses
 from unmix_plugin.captures.options import GONE_LAYOUTS, LAYOUTS, ProcessOptions, find_views, parse_mosaic
 from unmix_plugin.captures.plan import Plan, hashes, input_files, make_plan
-from unmix_plugin.captures.poses.estimation import WORK_FILES
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.pose_set import PosedCamera
 from unmix_plugin.captures.posing import (
@@ -44,21 +40,13 @@ from unmix_plugin.captures.report import Code, Kind, Remark, sentences
 from unmix_plugin.captures.spoilt import UnreadableViews, judge_sharpness
 from unmix_plugin.captures.wavelengths import parse_wavelengths
 from unmix_plugin.captures.writing.resampling import Resampling
-from unmix_plugin.captures.writing.scene_files import RECORD_NAME, match_views, seen_views, write_scene_files
+from unmix_plugin.captures.writing.scene_files import match_views, seen_views, write_scene_files
 from unmix_plugin.captures.writing.view_files import ViewRecord, write_view
+from unmix_plugin.captures.writing.work_folder import WorkFolder, refuse_output
 from unmix_plugin.engine.decisions import decision_table
-from unmix_plugin.engine.runs.atomic_files import make_folder, write_errors_as, write_file
 from unmix_plugin.engine.runs.replacing import (
-    TEMPORARY,
-    is_ours,
-    move_aside,
-    refuse_folder,
-    remove,
-    remove_folder,
-    remove_stale_temporaries,
     require_apart,
 )
-from unmix_plugin.engine.runs.run_folder import RunLock
 from unmix_plugin.errors import CaptureError, ConfigError, did_you_mean, name_some
 
 _Say = Callable[[str], None]
@@ -79,9 +67,10 @@ def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list
         ConfigError: an option is wrong or does not fit the files.
         RunError: the folder can't be written.
     """
+    # Load: what the options name, and which files are views.
     _check(options)
-    _refuse_output(options.output_dir, options.overwrite)
-    folder = _WorkFolder(options.output_dir)
+    refuse_output(options.output_dir, options.overwrite)
+    folder = WorkFolder(options.output_dir)
     folder.refuse_foreign()
     require_apart((folder.output, folder.path), _paths_read(options))
     references = _open_references(options)
@@ -90,11 +79,14 @@ def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list
     check_pose_options(options, capture)
     known = asked_distance(options, capture.views)
     wanted, left_out = _wanted_views(capture, options)
+
+    # Decide: from samples of the views, beside their cameras where these are known already.
     posed = None
     if options.poses not in FROM_PICTURES:
         posed = pose_views(wanted, given_poses(capture, options.poses), known)
     cameras = None if posed is None else posed.poses.cameras
-    plan = make_plan(capture, wanted if posed is None else posed.views, options, references, cameras)
+    chosen = wanted if posed is None else posed.views
+    plan = make_plan(capture, chosen, options, given=references, cameras=cameras)
     for note in sentences(plan.remarks, Kind.DONE):
         say(f"note: {note}")
     left_out |= plan.left_out
@@ -105,6 +97,8 @@ def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list
         (folder.output, folder.path),
         [("the capture's", path) for view in capture.views for path in input_files(view)],
     )
+
+    # Write: view after view, into a folder that an interrupted start may have left.
     resampled = {} if posed is None else _resampled_lenses(plan, posed)
     if folder.begin(
         {**plan.fingerprint(options), "lenses": sorted(numbers for _, numbers in resampled.values())}
@@ -113,6 +107,8 @@ def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list
     lenses = {name: lens for name, (lens, _) in resampled.items()}
     views = follow("writing views", plan.views if posed is None else posed.views)
     records, unreadable = _write_views(views, plan, lenses, folder)
+
+    # Examine: what is written; views that don't belong are left out of the scene.
     left_out |= unreadable
     left_out |= _blurred(plan, records, cameras, {*left_out, *options.keep_view})
     sound = {name: record for name, record in records.items() if name not in left_out}
@@ -139,12 +135,21 @@ def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list
     decided = decisions_of(plan, posed, reasons, options)
     for line in decision_table(decided):
         say(line)
-    findings = write_scene_files(folder.path, plan, posed, records, options, matched, reasons, decided)
+    findings = write_scene_files(
+        folder.path,
+        plan,
+        posed,
+        records,
+        options=options,
+        matched=matched,
+        left_out=reasons,
+        decided=decided,
+    )
     return [*findings, *folder.finish(options.overwrite)]
 
 
 def _write_views(
-    views: Iterable[CaptureView], plan: Plan, lenses: Mapping[str, Lens], folder: _WorkFolder
+    views: Iterable[CaptureView], plan: Plan, lenses: Mapping[str, Lens], folder: WorkFolder
 ) -> tuple[dict[str, ViewRecord], dict[str, Remark]]:
     """Write the files of all views that are not there yet, brought into other lenses where there are such; and say
     which can't be read, by name. Raises CaptureError: too many can't be."""
@@ -333,128 +338,3 @@ def _refuse_unlike(cube: Cube, first: Cube) -> None:
         raise CaptureError(
             f"{cube.path} holds {cube.dtype.name}; expected {first.dtype.name}, as {first.path} holds"
         )
-
-
-# The unfinished folder beside the output, in which the scene gathers.
-
-_PLAN, _VIEWS, _POSES, _LOCK = "plan.json", "views", "poses", "process.lock"
-_SCRATCH = re.compile(rf"{_LOCK}|(.*/)?{TEMPORARY.pattern}|{_POSES}/({WORK_FILES.pattern})")
-"""What the unfinished folder has beside listed files: the lock, what killed writers left, and COLMAP's files."""
-
-
-class _WorkFolder:
-    """The unfinished scene of one output folder. Views that are done survive a kill, and nothing takes the folder for a
-    scene, as it has no transforms.json and is called unfinished."""
-
-    def __init__(self, output: Path) -> None:
-        self.output = output.resolve()
-        self.path = self.output.with_name(f"{self.output.name}.unfinished")
-        """Where files are written until the scene is complete."""
-        self._lock: RunLock | None = None
-        self.poses = self.path / _POSES
-        """Where files of the estimation of poses lie while it runs, or after it failed."""
-
-    def refuse_foreign(self) -> None:
-        """Look before anything is computed whether the folder is this command's, and holds nothing else. Raises
-        ConfigError."""
-        if os.path.lexists(self.path):
-            if self.path.is_dir() and any(self.path.iterdir()) and not is_ours(self.path / _PLAN):
-                raise ConfigError(f"{self.path} is in the way and was not made by unmix-process; rename it")
-            refuse_folder(self.path, _SCRATCH)
-
-    def begin(self, plan: dict[str, Any]) -> bool:
-        """Make the folder, or go on in the one that an interrupted start left.
-
-        Views that were made with another plan (options, decisions and inputs) are thrown away.
-
-        Returns:
-            Whether an earlier start is gone on with.
-        Raises:
-            ConfigError: there is a folder of this name that is not ours, or has something in it that is not.
-            RunError: it can't be written.
-        """
-        plan_file, text = self.path / _PLAN, _json(plan)
-        if plan_file.is_file():
-            self._hold()
-        self.refuse_foreign()
-        if plan_file.is_file():
-            if plan_file.read_bytes() == text:
-                for folder in ("cubes", "images", "masks", _VIEWS):
-                    remove_stale_temporaries(self.path / folder)
-                return True
-            if self._lock is not None:
-                self._lock.release()  # Windows removes no file that is open
-            with write_errors_as(self.path):
-                remove_folder(self.path, _SCRATCH)
-        make_folder(self.path)
-        self._hold()
-        write_file(plan_file, text)
-        return False
-
-    def _hold(self) -> None:
-        """Let no other process write the same scene, until this one ends; RunError where another one does."""
-        if self._lock is not None:
-            self._lock.release()
-        self._lock = RunLock(self.path / _LOCK, "unmix-process")
-
-    def done(self, name: str) -> ViewRecord | None:
-        """What is recorded of a view that is written; None if it is not."""
-        try:
-            return ViewRecord(**json.loads(self._record(name).read_text(encoding="utf-8")))
-        except (OSError, ValueError, TypeError):
-            return None
-
-    def note(self, record: ViewRecord) -> None:
-        """Record that a view is written."""
-        write_file(self._record(record.name), _json(asdict(record)))
-
-    def finish(self, overwrite: bool) -> list[str]:
-        """Give the scene its name; the record of how it was made stays in it.
-
-        Returns:
-            What of an earlier scene is still there, in words.
-        Raises:
-            ConfigError: files that are not ours came into the earlier scene meanwhile.
-            RunError: it can't be moved.
-        """
-        earlier = None
-        with write_errors_as(self.output):
-            if self._lock is not None:
-                self._lock.release()
-            if overwrite and self.output.exists():
-                refuse_folder(self.output)
-                earlier = move_aside(self.output, "replaced")
-            elif self.output.exists():
-                self.output.rmdir()  # empty, see refuse_output
-            self.path.rename(self.output)
-            # After a kill here, the scene is whole and has some files too many.
-            remove_folder(self.output / _VIEWS)
-            remove_folder(self.output / _POSES, WORK_FILES)
-            remove(self.output / _PLAN)
-            (self.output / _LOCK).unlink(missing_ok=True)
-            if earlier is not None and remove_folder(earlier):
-                return [f"{earlier} keeps files of the earlier scene that unmix-process did not write"]
-        return []
-
-    def _record(self, name: str) -> Path:
-        return self.path / _VIEWS / f"{name}.json"
-
-
-def _refuse_output(output: Path, overwrite: bool) -> None:
-    """Look before anything is computed whether the scene can get its name. Raises ConfigError: the folder holds
-    something; with `overwrite`, something that this command did not make."""
-    if not output.resolve().name:
-        raise ConfigError(f"{output} can't be a scene; give a folder of its own with --output-dir")
-    if output.is_file():
-        raise ConfigError(f"{output} is a file; give a folder with --output-dir")
-    if not output.is_dir() or not any(output.iterdir()):
-        return
-    if not (output / RECORD_NAME).is_file():
-        raise ConfigError(f"{output} is not empty; give a new folder with --output-dir")
-    if not overwrite:
-        raise ConfigError(f"{output} holds a scene already; replace it with --overwrite, or choose another")
-    refuse_folder(output.resolve())
-
-
-def _json(value: Any) -> bytes:
-    return (json.dumps(value, indent=1, sort_keys=True) + "\n").encode()

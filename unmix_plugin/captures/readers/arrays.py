@@ -377,7 +377,7 @@ def _linear(path: Path, image: FoundArray, num_bands: int, remarks: list[Remark]
     named = plain_names(found)
     if "scale_factor" in named:  # before the factor of reflectances
         found.pop(named.get("reflectance_scale_factor", ""), None)
-    linear = state_linear(path, num_bands, found, "attribute", Format.ARRAYS, remarks)
+    linear = state_linear(path, num_bands, found, where="attribute", format_of=Format.ARRAYS, remarks=remarks)
     return linear or _prisma(path, image, num_bands)
 
 

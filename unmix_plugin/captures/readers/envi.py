@@ -134,7 +134,9 @@ def _described(file: Cube, header_path: Path, header: dict[str, str]) -> Cube:
     bands = check_bands(stated, num_bands, remarks)
     if bands.wavelengths_nm is None and own.wavelengths_nm is not None:
         bands = replace(own, bad=own.bad if bands.bad is None else bands.bad)
-    linear = state_linear(header_path, num_bands, header, "header field", Format.ENVI, remarks)
+    linear = state_linear(
+        header_path, num_bands, header, where="header field", format_of=Format.ENVI, remarks=remarks
+    )
     factors = [key for key in header if key.endswith("scale factor") and key != _FACTOR]
     factors = [key for key in factors if header[key].strip("{} ") not in ("1", "1.0")]
     remarks += [Remark.of(Code.FACTOR_NOT_APPLIED, entry=key, value=header[key]) for key in factors]

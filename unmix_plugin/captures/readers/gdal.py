@@ -65,7 +65,7 @@ def gdal_entries(items: GdalItems) -> dict[str, Any]:
 
 
 def gdal_linear(
-    path: Path, items: GdalItems, num_bands: int, where: str, remarks: list[Remark]
+    path: Path, items: GdalItems, num_bands: int, *, where: str, remarks: list[Remark]
 ) -> Linear | None:
     """Gains and offsets, where bands may lack their own. Raises CaptureError: they are no numbers, or impossible."""
     entries = gdal_entries(items)
@@ -78,7 +78,7 @@ def gdal_linear(
                 entry = f"{where} '{key}'"
                 remarks.append(Remark(Code.GAINS_OF_SOME_BANDS, {"entry": entry, **facts}))
             entries[key] = [items[key].get(band, usual) for band in range(num_bands)]
-    return state_linear(path, num_bands, entries, where, Format.GDAL, remarks)
+    return state_linear(path, num_bands, entries, where=where, format_of=Format.GDAL, remarks=remarks)
 
 
 def gdal_number(text: str) -> float | None:
@@ -138,7 +138,7 @@ def _with_xml(file: Cube, found: Path, remarks: list[Remark]) -> Cube:
     if bands.wavelengths_nm is None and (stated.centres or stated.names):
         table = check_bands(stated, num_bands, remarks).marking(bands.bad)
         bands = replace(table, names=table.names if bands.names is None else bands.names)
-    linear = file.linear or gdal_linear(file.path, items, num_bands, found.name, remarks)
+    linear = file.linear or gdal_linear(file.path, items, num_bands, where=found.name, remarks=remarks)
     if linear is not None and meaning:
         linear = replace(linear, source=f"{linear.source} of {meaning.value}", meaning=meaning)
     texts = items.get("no_data", {}).values()

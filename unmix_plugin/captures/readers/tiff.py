@@ -141,12 +141,12 @@ def open_tiff(path: Path, options: ReadOptions) -> Cube:
     interleave = None if first.samplesperpixel == 1 else "bsq" if first.planarconfig == 2 else "bip"
     if is_stack:
         num_known = None if given is None else len(given)
-        axes = choose_axes(stack.shape, options.axes, num_known, remarks, "byx")
+        axes = choose_axes(stack.shape, options.axes, num_known, remarks, default="byx")
         interleave = {"b": "bsq", "y": "bip" if axes[2] == "b" else "bil"}.get(axes[0])
     shape = image_shape(stack.shape, axes)
     allow_parts(path, shape[2], "bands", CaptureError, MOST_BANDS)
     bands = check_bands(stated, shape[2], remarks)
-    linear = gdal_linear(path, items, shape[2], "GDAL's", remarks)
+    linear = gdal_linear(path, items, shape[2], where="GDAL's", remarks=remarks)
     applied = () if linear is None else linear.entries
     exposed = {f"EXIF {name}": value for name, value in tags.exif.items()}
     exposed |= {name: value for name, value in entries.items() if name not in applied}

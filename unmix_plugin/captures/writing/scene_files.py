@@ -80,6 +80,7 @@ def write_scene_files(
     plan: Plan,
     posed: PosedViews,
     records: dict[str, ViewRecord],
+    *,
     options: ProcessOptions,
     matched: MatchedScene,
     left_out: Sequence[Remark] = (),
