@@ -19,7 +19,7 @@ from unmix_plugin.engine.geometry.camera_paths import upright_cameras
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.scenes.demo.scene import Place, make_demo_scene
 from unmix_plugin.scenes.demo.shading import MATERIALS, THINGS, Surface, Thing, smooth_step
-from unmix_plugin.scenes.demo.shapes import PerRay, Placement, Points
+from unmix_plugin.scenes.demo.shapes import PerRay, PlacedPrimitive, Points
 
 BEFORE_LIGHT, MORE_LIGHT = 0.75, 1.2
 """Of the first capture, so that what is lit more stays below full scale; and of the others, of that."""
@@ -75,7 +75,7 @@ CHANGES = (
 class _ChangedSurface(Surface):
     """A surface with a change, which knows where in the world it is."""
 
-    placement: Placement = Placement("sphere", (0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+    placement: PlacedPrimitive = PlacedPrimitive("sphere", (0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
     change: Planted = CHANGES[0]
 
     def abundances(self, local_points: Points) -> Float[np.ndarray, "P K"]:
@@ -114,7 +114,7 @@ def _things(change: Planted) -> Sequence[Thing]:
     ]
     if change.bump > 0 and change.region is not None:
         plate, region = THINGS[0], change.region
-        placement = Placement("sphere", region.center, (region.radius, region.radius, change.bump))
+        placement = PlacedPrimitive("sphere", region.center, (region.radius, region.radius, change.bump))
 
         def as_on_the_plate(points: Points) -> PerRay:
             world = points * np.asarray(placement.half_sizes, points.dtype) + np.asarray(

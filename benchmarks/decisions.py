@@ -38,7 +38,7 @@ from unmix_plugin.engine.training.steps import prepare_steps
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes.demo.scene import PLACES, Place, demo_cameras, make_demo_scene
 from unmix_plugin.scenes.demo.shading import MATERIALS, THINGS, Surface, Thing, plain
-from unmix_plugin.scenes.demo.shapes import Placement
+from unmix_plugin.scenes.demo.shapes import PlacedPrimitive
 
 _BANDS, _FLOOR, _CEILING = 8, -0.12, 5.0
 Triple = tuple[float, float, float]
@@ -85,7 +85,7 @@ class Case:
 
 
 def _slab(center: Triple, half: Triple, material: str, turn_deg: float = 0.0) -> Thing:
-    placement = Placement("box", center, half, turn_deg=turn_deg)
+    placement = PlacedPrimitive("box", center, half, turn_deg=turn_deg)
     return Thing(placement, Surface(material, material, plain))
 
 

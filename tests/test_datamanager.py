@@ -224,10 +224,10 @@ def test_light_outside_a_mask_counts_as_evidence(scene_folder, tmp_path):
     true, spoilt = make(scene_folder), make(folder)
     assert holed.sum() > 20
     np.testing.assert_array_equal(true.initial_data()["reachable"], spoilt.initial_data()["reachable"])
-    trust = torch.cat([spoilt.next_train(step)[1]["alpha_trust"] for step in range(20)])
+    trust = torch.cat([spoilt.next_train(step)[1]["alpha_confidence"] for step in range(20)])
     assert 0.005 < float((trust == 0).double().mean()) < 0.1
     believing = make(folder, trust_alpha=True)
-    assert bool((believing.next_train(0)[1]["alpha_trust"] == 1).all())
+    assert bool((believing.next_train(0)[1]["alpha_confidence"] == 1).all())
 
 
 def test_noise_stripes_and_spikes_are_found_and_named(tmp_path):

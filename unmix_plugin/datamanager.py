@@ -73,7 +73,7 @@ DEMO = Path("demo")
 class HyperspectralDataManager(DataManager):
     """Serves pixels of the training views, drawn evenly from all valid ones.
 
-    A training batch has R P rays, `spectra` (R, B), `alpha` (R), `alpha_trust` (R, see `spectral.evidence`) and
+    A training batch has R P rays, `spectra` (R, B), `alpha` (R), `alpha_confidence` (R, see `spectral.evidence`) and
     `pixels` (R), the number of each; an image batch has `spectra` (H, W, B),
     `alpha` (H, W), `valid` (H, W) and, where the scene has them, `labels` (H, W) and `abundances` (H, W, K).
     """
@@ -117,7 +117,7 @@ class HyperspectralDataManager(DataManager):
                 spectra=drawn.spectra,
                 alpha=drawn.alpha,
                 pixels=drawn.numbers,
-                alpha_trust=self._evidence.trust(drawn),
+                alpha_confidence=self._evidence.confidence(drawn),
                 surfaces=self._surfaces.points(drawn),
             )
             measured.append(own)

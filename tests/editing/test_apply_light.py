@@ -18,7 +18,7 @@ from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import illuminant_power, linear_to_srgb, rgb_matrix, xyz_matrix
 from unmix_plugin.spectral.library.material_library import measured_library
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable
-from unmix_plugin.spectral.sensor import Sensor
+from unmix_plugin.spectral.sensor import SpectralResponses
 from unmix_plugin.trained.outputs import OUTPUTS
 
 BANDS = Bands.of(WAVELENGTHS_NM)
@@ -212,7 +212,9 @@ CHANNELS = {
     "far": [0, 0, 0, 0, 0, 0, 0, 1.0, 1],
 }
 AT_NM = [430, 470, 520, 580, 670, 671, 899, 900, 950]
-SENSOR = Sensor("toy", SpectraTable(Bands.of(AT_NM), tuple(CHANNELS), np.array([*CHANNELS.values()])))
+SENSOR = SpectralResponses(
+    "toy", SpectraTable(Bands.of(AT_NM), tuple(CHANNELS), np.array([*CHANNELS.values()]))
+)
 """Three channels that the bands cover, and one that they don't."""
 
 MATRIX = torch.from_numpy(SENSOR.seen_by(BANDS).matrix).float()
@@ -259,7 +261,7 @@ def test_every_output_can_be_rendered_through_the_sensor_in_its_bands_and_colour
     assert "highlights can't be #00ff00" in edit_note
     assert description.startswith("seen through toy: blue 4")
     assert left_out == "left out far (900-950 nm): the bands cover 425-675 nm"
-    far = Sensor("far", SpectraTable(Bands.of([900, 950]), ("far",), np.ones((1, 2))))
+    far = SpectralResponses("far", SpectraTable(Bands.of([900, 950]), ("far",), np.ones((1, 2))))
     with pytest.raises(SpectrumError, match="'far' sees nothing: the bands cover 425-675 nm"):
         with_sensor(lit_scene(), far)
 

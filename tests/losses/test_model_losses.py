@@ -137,6 +137,10 @@ def test_impossible_losses_are_refused(settings, message):
 
 def test_where_alpha_is_not_trusted_missing_opacity_costs_nothing():
     spectra = torch.full((2, NUM_BANDS), 0.3)
-    batch = {"spectra": spectra, "alpha": torch.tensor([1.0, 1.0]), "alpha_trust": torch.tensor([1.0, 0.0])}
+    batch = {
+        "spectra": spectra,
+        "alpha": torch.tensor([1.0, 1.0]),
+        "alpha_confidence": torch.tensor([1.0, 0.0]),
+    }
     model = make_model(losses=LossConfig(background="white", abundances=0.0, rgb=0.0))
     assert float(losses_of(model, batch, spectra, torch.zeros(2))["spectral"]) == pytest.approx(0.5)

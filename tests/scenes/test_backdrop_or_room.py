@@ -17,7 +17,7 @@ from unmix_plugin.scenes.backdrop_trial import measure_distance
 from unmix_plugin.scenes.backdrops import find_before_backdrop
 from unmix_plugin.scenes.demo.scene import Place, demo_cameras, make_demo_scene
 from unmix_plugin.scenes.demo.shading import MATERIALS, THINGS, Surface, Thing, plain
-from unmix_plugin.scenes.demo.shapes import Placement
+from unmix_plugin.scenes.demo.shapes import PlacedPrimitive
 from unmix_plugin.scenes.geometry.view_agreement import training_views
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.scenes.scene import Scene
@@ -32,7 +32,7 @@ Place3 = tuple[float, float, float]
 def slab(center: Place3, half: Place3, material: str, turn_deg: float = 0.0) -> Thing:
     x, y, z = (float(place) for place in center)
     across, along, high = (float(size) for size in half)
-    placement = Placement("box", (x, y, z), (across, along, high), turn_deg=turn_deg)
+    placement = PlacedPrimitive("box", (x, y, z), (across, along, high), turn_deg=turn_deg)
     return Thing(placement, Surface(material, material, plain))
 
 

@@ -19,7 +19,7 @@ def test_a_background_as_bright_as_matter_says_nothing():
     spectra = torch.cat([torch.full((50, 6), 0.8), torch.full((50, 6), 0.3)])
     alpha = torch.cat([torch.zeros(50), torch.ones(50)])
     assert evidence.background_level(spectra, alpha) is None
-    assert_close(evidence.alpha_trust(spectra, alpha, None), torch.ones(100))
+    assert_close(evidence.alpha_confidence(spectra, alpha, None), torch.ones(100))
 
 
 @pytest.mark.parametrize(
@@ -35,8 +35,8 @@ def test_a_background_as_bright_as_matter_says_nothing():
 )
 def test_alpha_is_believed_unless_light_contradicts_it(value, alpha, trust, shows):
     spectra, alphas = torch.full((1, 6), value), torch.tensor([alpha])
-    assert float(evidence.alpha_trust(spectra, alphas, 0.002)) == trust
-    assert bool(evidence.may_show_matter(spectra, alphas, 0.002)) == shows
+    assert float(evidence.alpha_confidence(spectra, alphas, 0.002)) == trust
+    assert bool(evidence.may_show_foreground(spectra, alphas, 0.002)) == shows
 
 
 def test_only_dark_scenes_are_exposed_and_one_saturated_band_blows_a_pixel_out():

@@ -8,18 +8,18 @@ from hypothesis import strategies as st
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable
-from unmix_plugin.spectral.sensor import Sensor, read_sensor
+from unmix_plugin.spectral.sensor import SpectralResponses, read_sensor
 
 BANDS = Bands.of(np.linspace(400, 700, 31))
 """Cover 395-705 nm."""
 
 
-def sensor(wavelengths_nm, **responses) -> Sensor:
+def sensor(wavelengths_nm, **responses) -> SpectralResponses:
     values = np.array(list(responses.values()), dtype=np.float64)
-    return Sensor("toy", SpectraTable(Bands.of(wavelengths_nm), tuple(responses), values))
+    return SpectralResponses("toy", SpectraTable(Bands.of(wavelengths_nm), tuple(responses), values))
 
 
-def box(low: float, high: float) -> Sensor:
+def box(low: float, high: float) -> SpectralResponses:
     """One channel that responds evenly from one wavelength to another."""
     return sensor([low, high], box=[1, 1])
 

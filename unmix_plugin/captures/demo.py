@@ -47,7 +47,7 @@ from unmix_plugin.scenes.demo.shading import (
     render_view,
     speckled_things,
 )
-from unmix_plugin.scenes.demo.shapes import Placement
+from unmix_plugin.scenes.demo.shapes import PlacedPrimitive
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 
@@ -150,7 +150,7 @@ def make_demo_capture(
 def marked_place(things: Sequence[Thing] | None = None) -> Place:
     """The table (or other things) with a board of markers around the plate, as seen by a lens that is wide enough.
     Raises ConfigError: OpenCV, which knows the markers, is not installed."""
-    placement = Placement("box", (0.0, 0.0, _BOARD_TOP - 0.02), (_BOARD_REACH, _BOARD_REACH, 0.02))
+    placement = PlacedPrimitive("box", (0.0, 0.0, _BOARD_TOP - 0.02), (_BOARD_REACH, _BOARD_REACH, 0.02))
     board = Thing(placement, Surface("white", "purple", _print_of_markers()))
     cameras = partial(demo_cameras, angle_deg=_BOARD_ANGLE_DEG)
     return Place((*(things or speckled_things()), board), cameras)

@@ -70,7 +70,7 @@ from unmix_plugin.spectral.library.material_library import (
     measured_library,
 )
 from unmix_plugin.spectral.materials import Coefficients
-from unmix_plugin.spectral.sensor import Sensor
+from unmix_plugin.spectral.sensor import SpectralResponses
 from unmix_plugin.trained.trained_scene import TrainedScene
 
 
@@ -163,7 +163,7 @@ def _retinted(
     return np.clip(reflectance + base * solution.x, 0.0, max(greatest, float(reflectance.max())))
 
 
-def with_sensor(scene: TrainedScene, sensor: Sensor) -> TrainedScene:
+def with_sensor(scene: TrainedScene, sensor: SpectralResponses) -> TrainedScene:
     """The scene as the sensor sees it; its `notes` say what of the sensor the bands do not cover.
 
     The result can't be edited any more: edits and lights need the bands.

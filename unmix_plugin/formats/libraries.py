@@ -107,7 +107,7 @@ def _is_library(header_path: Path) -> bool:
         return "library" in read_header(header_path).get("file type", "").lower()
     except ValueError:
         return False
-    except OSError:  # which is said where it is read
+    except OSError:  # which is reported where it is read
         return True
 
 

@@ -230,7 +230,7 @@ def write_glb(
 
 @dataclass(frozen=True)
 class Gaussians:
-    """Gaussians: ellipsoids of matter that fades from their centres."""
+    """Gaussians: ellipsoids whose opacity fades from their centres."""
 
     positions: Float32[np.ndarray, "P 3"]
     rotations: Float32[np.ndarray, "P 4"]

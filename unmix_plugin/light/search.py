@@ -77,8 +77,8 @@ class _LampEvidence:
             light = light * self._visible(towards)
         expected = _within(torch.log(AMBIENT + light), self.place)
         slope = (expected * self.changes).sum() / expected.square().sum().clamp(min=1e-12)
-        left = (self.changes - slope.clamp(min=0) * expected).square().sum()
-        return float(1 - left / self.changes.square().sum().clamp(min=1e-12))
+        residual = (self.changes - slope.clamp(min=0) * expected).square().sum()
+        return float(1 - residual / self.changes.square().sum().clamp(min=1e-12))
 
     def _visible(self, towards: Float[Tensor, "S 3"]) -> Float[Tensor, " S"]:
         """Part of the light from these directions that the hull lets through to each place."""

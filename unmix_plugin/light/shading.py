@@ -1,9 +1,9 @@
 """How surfaces look: small networks, functions of directions, and shading in the light of a lamp whose place is known.
 
-A lit surface is matt, with a gloss where it mirrors the lamp:
+A lit surface is matt, with a specular highlight where it mirrors the lamp:
 
     s(x, d) = sigmoid(s_0 + ...) (r + (1 - r) V max(0, n . l))          matt (Lambert), r from all around
-    t_k(x, d) = V exp(-m_k (1 - (n . h)^2))                             gloss, h halfway between l and the eye
+    t_k(x, d) = V exp(-m_k (1 - (n . h)^2))                             specular, h halfway between l and the eye
 
 The normal n is learnt from what the light does, with r: a lamp that moves shows normals better than thin densities do.
 All places of a material mirror alike around their normals, so that few highlights tell where others will be.

@@ -133,7 +133,7 @@ class AbundanceGuide(nn.Module):
 
 def _is_informative(measured: MeasuredPixels) -> Bool[Tensor, "R"]:
     found = has_spectral_shape(measured.spectra)
-    return found if measured.alpha_trust is None else found & (measured.alpha_trust > 0)
+    return found if measured.alpha_confidence is None else found & (measured.alpha_confidence > 0)
 
 
 def mixing_penalty(pixels: Float[Tensor, "N B"], endmembers: Float[Tensor, "K B"]) -> float:

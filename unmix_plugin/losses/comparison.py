@@ -191,7 +191,7 @@ class BatchComparison:
             grey = torch.rand(grey.shape, generator=generator, device=device).to(grey)
         elif self.config.background == "white":
             grey = grey + 1
-        return grey if measured.alpha_trust is None else grey * measured.alpha_trust[:, None]
+        return grey if measured.alpha_confidence is None else grey * measured.alpha_confidence[:, None]
 
     def _tells_materials(self, part: ComparedPixels) -> bool:
         return self.seen_by.tells_materials(part.measured.sensor, len(self.guide.endmembers))

@@ -8,9 +8,10 @@ What moves all views alike (a similarity of the world about the scene's middle) 
 taken out of the corrections. A view that goes farther than `LARGEST_STEP` has lost its way: it gets its given pose
 back, and keeps it unless the grid is still coarse.
 
-A pose that is wrong by many pixels asks for matter where none is, and gets haze. So the errors of pixels that show
-matter are kept in mind for each knot. Where they are more than `LARGEST_RATIO` times the median, the pixels are
-outliers: they shape the scene less, by the square of what is too much, but pull at their pose with full weight.
+A pose that is wrong by many pixels asks for density where nothing is, and gets haze. So the errors of pixels that
+show the foreground are kept in mind for each knot. Where they are more than `LARGEST_RATIO` times the median, the
+pixels are outliers: they shape the scene less, by the square of what is too much, but pull at their pose with full
+weight.
 
 Notation: `V` training views, `M` knots of all views, `R` rays. A step is (w, m): the camera turns by the rotation
 vector w in world axes about itself, and moves by m times its reach, both times its scale.
@@ -82,10 +83,10 @@ class _RobustWeights(nn.Module):
 
     @torch.no_grad()
     def update(
-        self, knots: Int[Tensor, " R"], squares: Float[Tensor, " R"], shows_matter: Bool[Tensor, " R"]
+        self, knots: Int[Tensor, " R"], squares: Float[Tensor, " R"], shows_foreground: Bool[Tensor, " R"]
     ) -> None:
         """Note the mean squared errors of pixels, each near one of the knots; infinite ones and NaN are left out."""
-        is_known = shows_matter & squares.isfinite()
+        is_known = shows_foreground & squares.isfinite()
         shown, squares = is_known.to(squares), squares.where(is_known, 0.0)
         self.squares.mul_(_MEMORY).index_add_(0, knots, squares)
         self.counts.mul_(_MEMORY).index_add_(0, knots, shown)
@@ -131,9 +132,11 @@ class PoseRefinement(nn.Module):
     """Radians, or reaches, that a step of 1 stands for at each knot, in (0, 1]."""
     bound: Tensor
     """Largest correction at each knot, radians or share of the distance to the scene's middle."""
-    shares: Tensor
+    fractions: Tensor
     """Of the distance to the scene's middle, that are the reach at each knot."""
     gauge: Tensor
+    """Directions of steps that pictures can't tell: all cameras turned, moved or scaled alike (the ambiguity of
+    scale)."""
     is_free: Tensor
     carved: Tensor
     """Whether space was carved by the corrected cameras."""
@@ -153,8 +156,8 @@ class PoseRefinement(nn.Module):
         self.register_buffer("reach", torch.ones(total))
         self.register_buffer("scale", torch.ones(total))
         self.register_buffer("bound", torch.full((total,), LARGEST_STEP))
-        shares = torch.where(counts > 1, _LINE_REACH, 1.0).repeat_interleave(counts)
-        self.register_buffer("shares", shares, persistent=False)
+        fractions = torch.where(counts > 1, _LINE_REACH, 1.0).repeat_interleave(counts)
+        self.register_buffer("fractions", fractions, persistent=False)
         self.register_buffer("gauge", torch.zeros(6 * total, 7))
         self.register_buffer("is_free", torch.ones(len(rows), dtype=torch.bool))
         self.register_buffer("carved", torch.zeros((), dtype=torch.bool))
@@ -172,9 +175,9 @@ class PoseRefinement(nn.Module):
     @torch.no_grad()
     def begin(self, positions: Float[Tensor, "M 3"], box: SceneBox, pixel_size: float) -> None:
         """Take in where the cameras stand at the knots, the scene, and how large a pixel is at its middle."""
-        offsets = (positions - box.aabb.mean(dim=0)).to(self.shares)
+        offsets = (positions - box.aabb.mean(dim=0)).to(self.fractions)
         distances = offsets.norm(dim=1).clamp(min=1e-6)
-        self.reach.copy_(self.shares * distances)
+        self.reach.copy_(self.fractions * distances)
         self.scale.copy_((pixel_size / distances / _COARSEST_PIXEL).clamp(max=1.0))
         sight = 0.5 * box.size.max() / distances
         self.bound.copy_(LARGEST_STEP * (sight / _SMALLEST_SIGHT).clamp(max=1.0))
@@ -273,7 +276,7 @@ class PoseRefinement(nn.Module):
     def _sizes(self, steps: Float[Tensor, "M 6"]) -> Float[Tensor, "M 2"]:
         """Of turns, radians, and shifts, share of the distance to the scene's middle."""
         turns, shifts = (steps * self.scale[:, None]).view(-1, 2, 3).norm(dim=-1).unbind(dim=1)
-        return torch.stack([turns, shifts * self.shares], dim=1)
+        return torch.stack([turns, shifts * self.fractions], dim=1)
 
     def _at_knots(self) -> Float[Tensor, "M 6"]:
         """What the steps add up to at the knots."""

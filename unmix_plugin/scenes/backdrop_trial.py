@@ -75,7 +75,7 @@ def try_backdrop(views: Views) -> TriedBackdrop:
     if before is None:
         return TriedBackdrop(decision=Decision("backdrop", "none", {}, "", "--world"))
     box, contradicted = None, 0.0
-    if before.shows_matter:
+    if before.shows_foreground:
         box, contradicted = contradicted_share(views.cameras, before.masks())
     distance = measure_distance(views, before)
     outcome = "found"

@@ -129,7 +129,7 @@ class BeforeBackdrop:
     """Colour and brightness of the backdrop."""
 
     @property
-    def shows_matter(self) -> bool:
+    def shows_foreground(self) -> bool:
         """Whether there is anything but the backdrop."""
         return bool(np.mean([mask.mean() for mask in self.thinned]) > 1 - _ALL)
 

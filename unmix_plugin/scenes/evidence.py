@@ -1,4 +1,4 @@
-"""What training views are evidence of: where alpha can be trusted, how bright places are, what each band is worth.
+"""What the pixels of training views tell: confidence in alpha, the brightness of places, weights of bands.
 
 The rules for single pixels are in `spectral.evidence`; here they are applied sensor by sensor.
 
@@ -21,10 +21,10 @@ from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.bad_values import BandNoise, judge_bands
 from unmix_plugin.spectral.evidence import (
     OPAQUE_ALPHA,
-    alpha_trust,
+    alpha_confidence,
     background_level,
     brightness,
-    may_show_matter,
+    may_show_foreground,
     relative_power_of,
 )
 
@@ -38,16 +38,16 @@ _PIXELS_TO_JUDGE_BY = 20_000
 
 
 class AlphaEvidence:
-    """Where alpha can be trusted, and what may show something."""
+    """How sure alpha is, and which pixels may show something."""
 
     def __init__(self, table: PixelTable, has_alpha: bool) -> None:
         """Judge the background of each sensor; without alpha nothing contradicts anything."""
         self._blocks = table.blocks
         self._levels = {block.sensor: _level(block) if has_alpha else None for block in self._blocks}
 
-    def trust(self, pixels: DrawnPixels) -> Float[Tensor, " R"]:
-        """How far the alpha of drawn pixels can be trusted, 0 or 1."""
-        return alpha_trust(pixels.spectra, pixels.alpha, self._levels[pixels.sensor])
+    def confidence(self, pixels: DrawnPixels) -> Float[Tensor, " R"]:
+        """Confidence in the alpha of drawn pixels, 0 or 1."""
+        return alpha_confidence(pixels.spectra, pixels.alpha, self._levels[pixels.sensor])
 
     def foreground(self) -> Masks:
         """For each training view True on pixels that may show something, or are not valid."""
@@ -56,7 +56,7 @@ class AlphaEvidence:
             level = self._levels[block.sensor]
 
             def shows(spectra: Tensor, alpha: Tensor, valid: Tensor, level: float | None = level) -> Tensor:
-                return may_show_matter(spectra, alpha, level) | ~valid
+                return may_show_foreground(spectra, alpha, level) | ~valid
 
             for camera, picture in zip(block.cameras, block.pictures(shows), strict=True):
                 found[camera] = picture.numpy()

@@ -1,4 +1,4 @@
-"""All that may be said of a scene folder: a code for logic and tests, and the template of the sentence for people.
+"""All messages about a scene folder: a code for logic and tests, and the template of the sentence for people.
 
 A sentence says what was found against what was expected, and what to do. docs/reference/scene-folder.md lists them all;
 `python -m tests.docs.test_scene_messages` writes that list anew.

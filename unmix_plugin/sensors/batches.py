@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-_COLUMNS = ("alpha", "pixels", "alpha_trust", "surfaces")
+_COLUMNS = ("alpha", "pixels", "alpha_confidence", "surfaces")
 
 
 @dataclass(frozen=True)
@@ -31,8 +31,8 @@ class MeasuredPixels:
     alpha: Float[Tensor, "R"]
     pixels: Int[Tensor, "R"]
     """Number of each."""
-    alpha_trust: Float[Tensor, "R"] | None = None
-    """How far alpha can be trusted, 0 or 1; None: everywhere."""
+    alpha_confidence: Float[Tensor, "R"] | None = None
+    """Confidence in alpha, 0 or 1; None: 1 everywhere."""
     surfaces: Float[Tensor, "R 3"] | None = None
     """Places that the pixels are known to show, model space, NaN where unknown; None where none are known."""
 

@@ -1,4 +1,4 @@
-"""Measured values and bands that are not to be trusted: stripes, spikes, dead bands, bands that are mostly noise."""
+"""Measured values and bands that are unreliable: stripes, spikes, dead bands, bands that are mostly noise."""
 
 from __future__ import annotations
 

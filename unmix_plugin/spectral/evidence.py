@@ -1,7 +1,7 @@
-"""What a measured pixel is evidence of, and how far a rendered one is from it.
+"""What a measured pixel tells, and how far a rendered one is from it.
 
-Alpha is evidence, not law: masks err by a pixel along edges, have holes and specks. Light is evidence too. Where the
-two contradict each other, alpha is not trusted, and only light counts.
+Alpha is an observation like light, and masks err: by a pixel along edges, with holes and specks. Where the two
+contradict each other, alpha has no confidence, and only light counts.
 
 Notation: `R` pixels, `B` bands; spectra are on black, premultiplied by alpha. The brightness of a pixel is the root
 mean square of its spectrum.
@@ -54,27 +54,27 @@ def is_blown_out(spectra: Float[Tensor, "*pixels B"]) -> Bool[Tensor, "*pixels"]
 
 
 def background_level(spectra: Float[Tensor, "R B"], alpha: Float[Tensor, "R"]) -> float | None:
-    """Brightness up to which a pixel can't be told from the background.
+    """Brightness up to which a pixel can't be distinguished from the background.
 
     0 where the background is black; None where it is unknown, or as bright as what is in front of it.
     """
     seen, is_background = brightness(spectra), alpha <= _TRANSPARENT
-    background, matter = seen[is_background], seen[~is_background]
-    if len(background) == 0 or len(matter) == 0:
+    background, foreground = seen[is_background], seen[~is_background]
+    if len(background) == 0 or len(foreground) == 0:
         return None
     median = background.median()
     deviation = _SIGMA_OF_MAD * (background - median).abs().median()
     level = float(median + _SIGMAS * deviation)
-    return level if level < _DARK_SHARE * float(matter.median()) else None
+    return level if level < _DARK_SHARE * float(foreground.median()) else None
 
 
-def alpha_trust(
+def alpha_confidence(
     spectra: Float[Tensor, "R B"], alpha: Float[Tensor, "R"], background: float | None
 ) -> Float[Tensor, "R"]:
-    """How far alpha can be trusted, 0 or 1; `background` is as `background_level` gives it.
+    """Confidence in alpha, 0 or 1; `background` is as `background_level` gives it.
 
-    Not where a pixel sends more light than its alpha lets through, nor where alpha says that something is there and
-    the light can't be told from the background's.
+    0 where a pixel sends more light than its alpha lets through, and where alpha is above 0 and the light can't be
+    distinguished from the background's.
     """
     if background is None:
         return torch.ones_like(alpha)
@@ -84,12 +84,13 @@ def alpha_trust(
     return (~(is_surplus | is_nothing)).to(alpha)
 
 
-def may_show_matter(
+def may_show_foreground(
     spectra: Float[Tensor, "R B"], alpha: Float[Tensor, "R"], background: float | None
 ) -> Bool[Tensor, "R"]:
-    """Pixels that may show something: by alpha where it is trusted, otherwise by their light. Arguments as above."""
-    is_trusted = alpha_trust(spectra, alpha, background) > 0
-    return torch.where(is_trusted, alpha > 0, brightness(spectra) > (background or 0.0))
+    """Pixels that may show something: by alpha where there is confidence in it, otherwise by their light. Arguments as
+    above."""
+    is_confident = alpha_confidence(spectra, alpha, background) > 0
+    return torch.where(is_confident, alpha > 0, brightness(spectra) > (background or 0.0))
 
 
 def exposure_of(pixels: Float[Tensor, "R B"]) -> float:

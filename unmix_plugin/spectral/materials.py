@@ -87,7 +87,7 @@ class Coefficients:
         return self.accumulation > OCCUPIED_ACCUMULATION
 
     def with_light(self, scaled_abundances: Float[Tensor, "*rays K"]) -> Coefficients:
-        """The same with more light of that mixture, and no more matter."""
+        """The same with more light of that mixture, and no more opacity."""
         first = 2 + self.num_endmembers
         packed = self.packed.clone()
         packed[..., first : first + self.num_endmembers] += scaled_abundances

@@ -52,7 +52,7 @@ class _SensorBands:
 
 
 @dataclass(frozen=True, eq=False)
-class Sensor:
+class SpectralResponses:
     """Relative spectral responses of the channels of a camera."""
 
     name: str
@@ -133,12 +133,12 @@ class Sensor:
         return f"{low:.0f}-{high:.0f} nm"
 
 
-def read_sensor(path: Path) -> Sensor:
+def read_sensor(path: Path) -> SpectralResponses:
     """A sensor from a table of relative spectral responses, `wavelength,NAME,NAME,...`; its name is the file's. Where a
     channel alone was not measured, it responds to nothing."""
     table = read_spectra(path, outside=0.0)
     try:
-        return Sensor(path.stem, table)
+        return SpectralResponses(path.stem, table)
     except SpectrumError as error:
         raise SpectrumError(f"{path}: {error}") from error
 

@@ -5,14 +5,14 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from tests.scenes.demo.demo_parts import PLACEMENTS, row
-from unmix_plugin.scenes.demo.shapes import Placement, first_hits
+from unmix_plugin.scenes.demo.shapes import PlacedPrimitive, first_hits
 
 coordinates = st.floats(-0.9, 0.9)
 
 
 @given(coordinates, coordinates, st.floats(0.2, 3.0))
 def test_a_sphere_is_hit_where_the_quadratic_formula_says(x, y, radius):
-    sphere = Placement("sphere", (0.5, -0.25, 1.0), (radius,) * 3, turn_deg=40.0, tilt_deg=-20.0)
+    sphere = PlacedPrimitive("sphere", (0.5, -0.25, 1.0), (radius,) * 3, turn_deg=40.0, tilt_deg=-20.0)
     origin, direction = row(0.5 + radius * x, -0.25 + radius * y, 9.0), row(0, 0, -1)
     distance = sphere.entry_distances(origin, direction)
     reach = 1 - x**2 - y**2
@@ -28,7 +28,7 @@ EXTENT = {"sphere": [[0, 1, 2]], "cylinder": [[0, 1], [2]], "box": [[0], [1], [2
 @pytest.mark.parametrize("primitive", EXTENT)
 @given(azimuth=st.floats(0, 6.28), height=st.floats(-0.95, 0.95), x=coordinates, y=coordinates, z=coordinates)
 def test_a_ray_enters_a_shape_through_its_surface_against_the_normal(primitive, azimuth, height, x, y, z):
-    placement = Placement(primitive, (0.3, -0.2, 0.1), (0.5, 0.7, 0.4), turn_deg=25.0, tilt_deg=50.0)
+    placement = PlacedPrimitive(primitive, (0.3, -0.2, 0.1), (0.5, 0.7, 0.4), turn_deg=25.0, tilt_deg=50.0)
     flat = np.sqrt(1 - height**2)
     origin = 5 * row(flat * np.cos(azimuth), flat * np.sin(azimuth), height)
     inside = placement.axes @ (np.array([x, y, z]) * 0.55 * placement.half_sizes) + placement.center
@@ -44,7 +44,7 @@ def test_a_ray_enters_a_shape_through_its_surface_against_the_normal(primitive, 
 
 
 def test_a_cylinder_is_hit_on_its_cap_from_above_and_on_its_side_from_the_side():
-    cylinder = Placement("cylinder", (1.0, 0.0, 0.0), (0.5, 0.5, 2.0))
+    cylinder = PlacedPrimitive("cylinder", (1.0, 0.0, 0.0), (0.5, 0.5, 2.0))
     origins = np.vstack([row(1.2, 0.1, 7), row(-3, 0, 1)])
     directions = np.vstack([row(0, 0, -1), row(1, 0, 0)])
     distances = cylinder.entry_distances(origins, directions)
@@ -55,7 +55,7 @@ def test_a_cylinder_is_hit_on_its_cap_from_above_and_on_its_side_from_the_side()
 
 def test_a_normal_of_a_squeezed_sphere_is_the_gradient_of_its_equation():
     sizes = np.array([0.5, 0.25, 1.0])
-    sphere = Placement("sphere", (0.0, 0.0, 0.0), (0.5, 0.25, 1.0))
+    sphere = PlacedPrimitive("sphere", (0.0, 0.0, 0.0), (0.5, 0.25, 1.0))
     local = np.array([[0.48, 0.6, 0.64]], dtype=np.float32)
     gradient = local[0] * sizes / sizes**2
     assert_allclose(sphere.normals_at(local)[0], gradient / np.linalg.norm(gradient), rtol=1e-5)

@@ -45,7 +45,7 @@ from unmix_plugin.scenes.demo.shading import (
     render_view,
     smooth_step,
 )
-from unmix_plugin.scenes.demo.shapes import Placement, Points, Rays
+from unmix_plugin.scenes.demo.shapes import PlacedPrimitive, Points, Rays
 from unmix_plugin.scenes.folder import lens_keys, matrix_entry, transforms_bytes
 from unmix_plugin.scenes.reading.faults import FILE_NAME
 from unmix_plugin.scenes.reading.images import UNLABELLED
@@ -235,7 +235,7 @@ def _patches(
 def _ground() -> Thing:
     # A cylinder's or a box's own coordinates are over its half sizes.
     period, fade = 1.3 / _GROUND_EDGE, 9.0 / _GROUND_EDGE
-    placement = Placement("box", (0.0, 0.0, _GROUND_HEIGHT - 0.5), (_GROUND_EDGE, _GROUND_EDGE, 0.5))
+    placement = PlacedPrimitive("box", (0.0, 0.0, _GROUND_HEIGHT - 0.5), (_GROUND_EDGE, _GROUND_EDGE, 0.5))
     return Thing(placement, Surface("green", "yellow", _patches(period, 0.7, fade)))
 
 
@@ -249,7 +249,9 @@ def _far_things(count: int = 14, seed: int = 5) -> list[Thing]:
         center = (distance * np.cos(angle), distance * np.sin(angle), _GROUND_HEIGHT + size)
         names = [str(name) for name in generator.choice(MATERIALS, 2, replace=False)]
         primitive = ("box", "sphere", "cylinder")[index % 3]
-        placement = Placement(primitive, center, (size, size, size), turn_deg=float(generator.uniform(0, 90)))
+        placement = PlacedPrimitive(
+            primitive, center, (size, size, size), turn_deg=float(generator.uniform(0, 90))
+        )
         blend = plain if index % 2 else _patches(1.3, float(index))
         found.append(Thing(placement, Surface(names[0], names[1], blend)))
     return found
@@ -274,7 +276,7 @@ def _room() -> list[Thing]:
     ]
     return [
         Thing(
-            Placement("box", center, half),
+            PlacedPrimitive("box", center, half),
             Surface(first, second, _patches(0.9, 1.3 * index, half_sizes=half)),
         )
         for index, (center, half, first, second) in enumerate(slabs)

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.scenes.demo.shapes import PerRay, Placement, Points, Rays, dot, first_hits
+from unmix_plugin.scenes.demo.shapes import PerRay, PlacedPrimitive, Points, Rays, dot, first_hits
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import illuminant_power
 
@@ -137,31 +137,33 @@ _RAYS_AT_ONCE = 2**14
 class Thing:
     """One object: its form, its surface, and the balls that stand for it where it hides the sky."""
 
-    placement: Placement
+    placement: PlacedPrimitive
     surface: Surface
     sky_blockers: tuple[tuple[float, float, float, float], ...] = ()
     """Balls as (x, y, z, radius) in the world."""
 
 
 THINGS = (
-    Thing(Placement("cylinder", (0.0, 0.0, -0.06), (1.3, 1.3, 0.06)), Surface("white", "red", _gingham)),
     Thing(
-        Placement("sphere", (-0.5, -0.42, 0.4), (0.44, 0.44, 0.4)),
+        PlacedPrimitive("cylinder", (0.0, 0.0, -0.06), (1.3, 1.3, 0.06)), Surface("white", "red", _gingham)
+    ),
+    Thing(
+        PlacedPrimitive("sphere", (-0.5, -0.42, 0.4), (0.44, 0.44, 0.4)),
         Surface("green", "yellow", _blush, roughness=0.1),
         ((-0.5, -0.42, 0.4, 0.42),),
     ),
     Thing(
-        Placement("box", (0.5, 0.42, 0.3), (0.34, 0.34, 0.3), turn_deg=28.0),
+        PlacedPrimitive("box", (0.5, 0.42, 0.3), (0.34, 0.34, 0.3), turn_deg=28.0),
         Surface("cyan", "white", _ribbon),
         ((0.5, 0.42, 0.3, 0.36),),
     ),
     Thing(
-        Placement("cylinder", (-0.42, 0.56, 0.42), (0.24, 0.24, 0.42)),
+        PlacedPrimitive("cylinder", (-0.42, 0.56, 0.42), (0.24, 0.24, 0.42)),
         Surface("purple", "yellow", _candy_stripes),
         ((-0.42, 0.56, 0.22, 0.26), (-0.42, 0.56, 0.62, 0.26)),
     ),
     Thing(
-        Placement("sphere", (0.42, -0.52, 0.25), (0.36, 0.25, 0.25), turn_deg=-35.0),
+        PlacedPrimitive("sphere", (0.42, -0.52, 0.25), (0.36, 0.25, 0.25), turn_deg=-35.0),
         Surface("yellow", "yellow", plain, roughness=0.15),
         ((0.42, -0.52, 0.25, 0.28),),
     ),
@@ -276,7 +278,7 @@ def _lamp_point(i: int, count: int, middle: _Place) -> Float[np.ndarray, "3"]:
 
 
 def _direct_light(
-    points: Points, normals: Points, lamps: Float[np.ndarray, "#P 3"], placements: Sequence[Placement]
+    points: Points, normals: Points, lamps: Float[np.ndarray, "#P 3"], placements: Sequence[PlacedPrimitive]
 ) -> PerPoint:
     """Irradiance of each point from one of the lamp's: 0 in the shadow of `placements`, no fall-off with distance."""
     towards_lamp = lamps - points

@@ -24,7 +24,7 @@ _SELF_HIT_DISTANCE = 1e-4
 
 
 @dataclass(frozen=True)
-class Placement:
+class PlacedPrimitive:
     """A primitive put into the world: scaled, turned about the vertical, tilted about x, then moved."""
 
     primitive: _Primitive
@@ -84,7 +84,7 @@ def dot(a: Float[np.ndarray, "P C"], b: Float[np.ndarray, "P C"]) -> Float[np.nd
 
 
 def first_hits(
-    placements: Sequence[Placement], origins: Rays, directions: Rays
+    placements: Sequence[PlacedPrimitive], origins: Rays, directions: Rays
 ) -> tuple[PerRay, Int[np.ndarray, " R"]]:
     """Distance of the nearest surface along each ray (inf where nothing is hit), and which placement it is of."""
     distances = np.stack([placement.entry_distances(origins, directions) for placement in placements])

@@ -3,7 +3,7 @@
 A cell stays if enough training cameras see it and, where pictures have alpha, no training view looks through it: a view
 looks through a cell if the cell's whole footprint, widened by a margin, lies in the image on background. The footprint
 is the bounding rectangle of the cell's projection, rounded outwards, so the hull is never too small. Masks may err:
-where the hull leaves matter unexplained, two views must look through a cell, or more.
+where the hull leaves foreground unexplained, two views must look through a cell, or more.
 
 What one or two views see is not held by the others, and what grows there fits single images only: with alpha half of
 the views must see a cell, unless that leaves pixels unexplained, without alpha a tenth. In an unbounded world two views

@@ -198,12 +198,12 @@ def _gain_spread(cameras: Cameras, positions: Float[Tensor, "P 3"], seen: Seen) 
     for half in (positions > positions.median(dim=0).values).T:
         one, other = _view_gains(seen[half]), _view_gains(seen[~half])
         both = one.isfinite() & other.isfinite()
-        left = int(both.sum()) - smooth.shape[1]
-        if left < _FEWEST_VIEWS:  # halves of a flight are seen by different views
+        freedom = int(both.sum()) - smooth.shape[1]
+        if freedom < _FEWEST_VIEWS:  # halves of a flight are seen by different views
             continue
         gains = torch.stack([one[both], other[both]], dim=1)
         rest = gains - smooth[both] @ torch.linalg.lstsq(smooth[both], gains, driver="gelsd").solution
-        shared.append(float(rest.prod(dim=1).sum()) / left)
+        shared.append(float(rest.prod(dim=1).sum()) / freedom)
     return max(min(shared, default=0.0), 0.0) ** 0.5
 
 
@@ -237,8 +237,8 @@ def _least_share(values: Seen, functions: Float[Tensor, "P N F"], halves: Bool[T
         for (x, y), (others, known) in (parts, parts[::-1]):
             fit = torch.linalg.lstsq(x, y[:, None]).solution[:, 0]
             total = float(known.square().sum())
-            left = float((known - others @ fit).square().sum())
-            shares.append(1.0 - left / total if total > 0 else 0.0)
+            residual = float((known - others @ fit).square().sum())
+            shares.append(1.0 - residual / total if total > 0 else 0.0)
 
     return min(shares)
 

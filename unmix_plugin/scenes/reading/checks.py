@@ -16,7 +16,7 @@ from unmix_plugin.errors import SpectrumError
 from unmix_plugin.scenes.folder import CUBE_KEY
 from unmix_plugin.scenes.messages import Message
 from unmix_plugin.scenes.reading.cubes import check_abundances, check_cubes, warn_clipped
-from unmix_plugin.scenes.reading.entries import FrameEntry, Size
+from unmix_plugin.scenes.reading.entries import FrameEntry, Shape
 from unmix_plugin.scenes.reading.faults import Faults
 from unmix_plugin.scenes.reading.images import check_colours, check_labels, check_masks
 from unmix_plugin.settings import SceneOptions
@@ -34,7 +34,7 @@ class CheckedFrame:
     cube: Path
     sha256: str
     """Of the cube."""
-    size: Size
+    size: Shape
     """Of its pictures."""
     sensor: int
     """Which of the sensors took it."""
@@ -58,7 +58,7 @@ class CheckedFiles:
         return self.frames[0].foreground is not None
 
     @property
-    def sizes(self) -> list[Size]:
+    def sizes(self) -> list[Shape]:
         """Of each frame's pictures."""
         return [frame.size for frame in self.frames]
 
@@ -107,7 +107,7 @@ def _union(one: _Pixels | None, other: _Pixels | None) -> _Pixels | None:
 def _read_operators(
     frames: Sequence[FrameEntry], wavelengths_nm: Float64[np.ndarray, " B"] | None, faults: Faults
 ) -> list[_Operator | None]:
-    """The operator of each frame, as `SceneSensor.matrix`; None where it can't be told, as without wavelengths."""
+    """The operator of each frame, as `SceneSensor.matrix`; None where it is unknown, as without wavelengths."""
     if wavelengths_nm is None:
         return [None] * len(frames)
     tables: dict[Path, _Operator | None] = {}
@@ -142,14 +142,14 @@ def _read_responses(path: Path, bands: Bands, where: str, faults: Faults) -> _Op
 
 
 def _group_by_sensor(
-    frames: Sequence[FrameEntry], operators: Sequence[_Operator], sizes: Sequence[Size], faults: Faults
+    frames: Sequence[FrameEntry], operators: Sequence[_Operator], sizes: Sequence[Shape], faults: Faults
 ) -> tuple[tuple[SceneSensor, ...], tuple[int, ...]]:
     """The sensors in the order in which they appear, and the index of each frame's.
 
     Frames without a name are of one sensor if their bands and sizes are the same, which is called such as
     `12-bands-24x24`, with a number behind it where another has that name.
     """
-    known: dict[str | tuple[bytes, Size], tuple[int, Size]] = {}
+    known: dict[str | tuple[bytes, Shape], tuple[int, Shape]] = {}
     sensors: list[SceneSensor] = []
     indices = []
     for frame, matrix, size in zip(frames, operators, sizes, strict=True):

@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float32
 from unmix_plugin.errors import name_some
 from unmix_plugin.scenes.folder import CUBE_KEY
 from unmix_plugin.scenes.messages import Message
-from unmix_plugin.scenes.reading.entries import FrameEntry, Size
+from unmix_plugin.scenes.reading.entries import FrameEntry, Shape
 from unmix_plugin.scenes.reading.faults import Faults, sha256_of
 from unmix_plugin.settings import SceneOptions
 
@@ -250,12 +250,12 @@ def check_cubes(
     operators: Sequence[np.ndarray | None],
     options: SceneOptions,
     faults: Faults,
-) -> tuple[list[Size | None], list[_CubeValues | None]]:
+) -> tuple[list[Shape | None], list[_CubeValues | None]]:
     """Check shapes and types against sizes and sensors (operators of (channels, B)), then every value; gives the sizes
     of the frames' images, None where nothing tells one, and what sound cubes hold."""
-    sizes: list[Size | None] = []
+    sizes: list[Shape | None] = []
     sound: list[Path | None] = []
-    shared: tuple[Size, str] | None = None
+    shared: tuple[Shape, str] | None = None
     for frame, operator in zip(frames, operators, strict=True):
         where, path, lens = frame.name_of(CUBE_KEY), frame.files.get(CUBE_KEY), frame.camera.lens
         shape = _read_shape(path, "(H, W, B)", where, faults)
@@ -330,7 +330,7 @@ def _read_shape(path: Path | None, layout: str, where: str, faults: Faults) -> t
 
 
 def check_abundances(
-    frames: Sequence[FrameEntry], sizes: Sequence[Size | None], num_materials: int | None, faults: Faults
+    frames: Sequence[FrameEntry], sizes: Sequence[Shape | None], num_materials: int | None, faults: Faults
 ) -> None:
     """Check the true abundances of all frames."""
     for frame, size in zip(frames, sizes, strict=True):

@@ -29,8 +29,8 @@ from unmix_plugin.scenes.placement import Normalisation, Placement, read_placeme
 from unmix_plugin.scenes.reading.faults import FILE_NAME, Faults, resolve_path
 from unmix_plugin.spectral.bands import require_nanometres
 
-Size = tuple[int, int]
-"""Height and width in pixels."""
+Shape = tuple[int, int]
+"""Rows and columns of an image, as arrays have them; widths come first where cameras are made."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class SceneEntry:
     warnings: tuple[str, ...] = ()
     """Keys that stand for something and are not followed, or that nobody knows."""
 
-    def cameras(self, sizes: Sequence[Size], normalisation: Normalisation) -> Cameras:
+    def cameras(self, sizes: Sequence[Shape], normalisation: Normalisation) -> Cameras:
         """Cameras of all frames, of images of these sizes, where there are no faults; `normalisation` leads from the
         space of transforms.json to that of the cameras."""
         cameras = [frame.camera for frame in self.frames]
@@ -200,7 +200,7 @@ def locate_files(root: Path, entry: SceneEntry, allow_outside: bool, faults: Fau
     return replace(entry, frames=tuple(frames))
 
 
-def at_sizes(entry: SceneEntry, sizes: Sequence[Size], faults: Faults) -> SceneEntry:
+def at_sizes(entry: SceneEntry, sizes: Sequence[Shape], faults: Faults) -> SceneEntry:
     """The entry with one pose for each line camera, too; notes a fault where poses of lines don't fit the image.
 
     Args:

@@ -15,7 +15,7 @@ from jaxtyping import Bool, UInt8
 from unmix_plugin.errors import SceneError
 from unmix_plugin.limits import allow_decoded
 from unmix_plugin.scenes.messages import Message
-from unmix_plugin.scenes.reading.entries import FrameEntry, Size
+from unmix_plugin.scenes.reading.entries import FrameEntry, Shape
 from unmix_plugin.scenes.reading.faults import Faults
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ class UnreadableImageError(ValueError):
     """A file is not a picture of the kind needed; the text says why and what to do."""
 
 
-def read_colour(path: Path, size: Size | None) -> UInt8[np.ndarray, "H W C"]:
+def read_colour(path: Path, size: Shape | None) -> UInt8[np.ndarray, "H W C"]:
     """Read sRGB (C = 3) or sRGB with alpha (C = 4), 8 bits; None: of any size. Raises UnreadableImageError: not a
     readable picture of this size with 8 bits a channel; SceneError: too large a one."""
 
@@ -50,7 +50,7 @@ def read_colour(path: Path, size: Size | None) -> UInt8[np.ndarray, "H W C"]:
     return read_picture(path, size, convert)
 
 
-def read_labels(path: Path, size: Size) -> UInt8[np.ndarray, "H W"]:
+def read_labels(path: Path, size: Shape) -> UInt8[np.ndarray, "H W"]:
     """Read class indices from an 8-bit picture of one channel (grey or palette; 255 = unlabelled). Raises
     UnreadableImageError: not a readable picture of this size with one 8-bit channel."""
 
@@ -64,7 +64,7 @@ def read_labels(path: Path, size: Size) -> UInt8[np.ndarray, "H W"]:
     return read_picture(path, size, convert)
 
 
-def read_mask(path: Path, size: Size) -> Bool[np.ndarray, "H W"]:
+def read_mask(path: Path, size: Shape) -> Bool[np.ndarray, "H W"]:
     """Read a mask: True where a pixel counts, False where it is black (nerfstudio's convention). Raises
     UnreadableImageError: not a readable picture of this size, or neither black and white nor two numbers."""
     return read_picture(path, size, white_of)
@@ -74,8 +74,8 @@ def white_of(image: Image.Image) -> Bool[np.ndarray, "H W"]:
     """Where a mask is white. The one rule for masks: white is what is brighter than half of the range.
 
     A mask whose numbers are all dark holds 0 and one other number, such as 1, which is its white. Opacity counts as
-    brightness over black. Raises UnreadableImageError: all is dark and there are several greys, so that white can't be
-    told.
+    brightness over black. Raises UnreadableImageError: all is dark and there are several greys, so that white is
+    ambiguous.
     """
     grey, top = _grey_of(image)
     brightest = grey.max(initial=0)
@@ -103,7 +103,7 @@ def _grey_of(image: Image.Image) -> tuple[np.ndarray, int]:
 
 def read_picture(
     path: Path,
-    size: Size | None,
+    size: Shape | None,
     convert: Callable[[Image.Image], np.ndarray],
     formats: tuple[str, ...] = FORMATS,
 ) -> np.ndarray:
@@ -134,7 +134,7 @@ _Pictures = list[Bool[np.ndarray, "_ _"] | None]
 
 
 def check_colours(
-    frames: Sequence[FrameEntry], sizes: Sequence[Size | None], faults: Faults
+    frames: Sequence[FrameEntry], sizes: Sequence[Shape | None], faults: Faults
 ) -> _Pictures | None:
     """Check all pictures; returns where each is not fully transparent, or None if the scene has no alpha.
 
@@ -159,7 +159,7 @@ def check_colours(
     return seen
 
 
-def check_masks(frames: Sequence[FrameEntry], sizes: Sequence[Size | None], faults: Faults) -> _Pictures:
+def check_masks(frames: Sequence[FrameEntry], sizes: Sequence[Shape | None], faults: Faults) -> _Pictures:
     """Check all masks; returns which pixels they keep."""
     masks: _Pictures = []
     for frame, size in zip(frames, sizes, strict=True):
@@ -171,7 +171,7 @@ def check_masks(frames: Sequence[FrameEntry], sizes: Sequence[Size | None], faul
 
 
 def check_labels(
-    frames: Sequence[FrameEntry], sizes: Sequence[Size | None], num_materials: int | None, faults: Faults
+    frames: Sequence[FrameEntry], sizes: Sequence[Shape | None], num_materials: int | None, faults: Faults
 ) -> None:
     """Check the true materials of all frames."""
     for frame, size in zip(frames, sizes, strict=True):
@@ -183,9 +183,9 @@ def check_labels(
 
 
 def _checked(
-    frame: FrameEntry, key: str, read: Callable[[Path, Size], np.ndarray], size: Size | None, faults: Faults
+    frame: FrameEntry, key: str, read: Callable[[Path, Shape], np.ndarray], size: Shape | None, faults: Faults
 ) -> np.ndarray | None:
-    """One picture; None if there is none, or if its size can't be judged because no cube told it."""
+    """One picture; None if there is none, or if its size is unknown because there is no cube."""
     if key not in frame.files or size is None:
         return None
     try:

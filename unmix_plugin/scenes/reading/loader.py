@@ -131,7 +131,7 @@ def _assemble(
     if fwhm_nm is not None and (unknown := int(np.isnan(fwhm_nm).sum())):
         warning = Message.UNKNOWN_WIDTHS.sentence(unknown=unknown, bands=len(fwhm_nm))
         fwhm_nm, warnings = None, (*warnings, warning)
-    if before is not None and not before.shows_matter:
+    if before is not None and not before.shows_foreground:
         before, warnings = None, (*warnings, Message.NOTHING_TO_SEE.sentence())
     known = {frame.cube: frame.sha256 for frame in checked.frames}
     files = [(key, path) for frame in entry.frames for key, path in frame.files.items()]

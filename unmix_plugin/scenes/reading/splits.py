@@ -34,7 +34,7 @@ class Split:
 def split_frames(
     entry: SceneEntry, method: Literal["auto", "lists", "filename", "interval"], interval: int, faults: Faults
 ) -> Split:
-    """Split the frames; notes a fault where training or evaluation is left without a frame."""
+    """Split the frames; notes a fault where training or evaluation has no frame."""
     if method == "lists" and not entry.split_lists:
         faults.note(FILE_NAME, Message.NO_SPLIT_LISTS)
         return Split((), ())

@@ -1,4 +1,4 @@
-"""One image alone: its endmembers, what each pixel is made of, and how far to trust that.
+"""One image alone: its endmembers, what each pixel is made of, and how certain that is.
 
 Notation: `H x W` pixels, `N` of them in use, `B` bands, `K` endmembers.
 """

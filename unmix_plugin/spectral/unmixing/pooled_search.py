@@ -80,7 +80,7 @@ class PooledEndmembers:
     endmembers: Float[Tensor, "K B"]
     """Spectra of length 1."""
     others: Float[Tensor, "S K B"]
-    """The best sets, in the same order of materials: how they differ says how far to trust what they agree on."""
+    """The best sets, in the same order of materials: how they differ shows how certain it is what they agree on."""
 
 
 def pooled_search(

@@ -173,9 +173,9 @@ def count_shapes(pixels: Float[Tensor, "N B"], enough: int) -> int:
     """Number of distinct shapes; counting stops at `enough`."""
     # Where each of a few pixels has a shape of its own there is no need to compare all.
     for some in (pixels[: 2 * enough], pixels):
-        left, count = normalize(some, dim=1), 0
-        while count < enough and len(left) > 0:
-            left = left[(left - left[0]).square().sum(dim=1) > _DISTINCT]
+        remaining, count = normalize(some, dim=1), 0
+        while count < enough and len(remaining) > 0:
+            remaining = remaining[(remaining - remaining[0]).square().sum(dim=1) > _DISTINCT]
             count += 1
         if count == enough:
             break
