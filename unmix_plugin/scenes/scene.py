@@ -8,13 +8,15 @@ that of transforms.json before its `applied_transform`, `applied_scale` and `off
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Shaped, UInt8
+from msgspec import Meta
 
 from unmix_plugin.engine.decisions import Decision
 from unmix_plugin.engine.geometry.cameras import Cameras
@@ -229,73 +231,67 @@ def scene_identity(summary: Mapping[str, Any]) -> dict[str, Any]:
     return {**{key: summary.get(key) for key in _COMPARED}, **rig, "files": hashes}
 
 
-_Numbers: TypeAlias = tuple[float, ...]
+_LEAST_SIZE = 1e-12  # what is divided by less leaves float32
+_Number = Annotated[float, Meta(ge=-1e300, le=1e300)]
+_Above0 = Annotated[float, Meta(gt=0, le=1e300)]
+_Size = Annotated[float, Meta(gt=_LEAST_SIZE, le=1e300)]
+_Three = tuple[_Number, _Number, _Number]
 
 
-@dataclass(frozen=True)
-class _RecordedFrame:
+class _RecordedFrame(msgspec.Struct):
     """A `Normalisation` in JSON."""
 
-    rotation: tuple[_Numbers, _Numbers, _Numbers] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-    translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    scale: float = 1.0
-    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rotation: tuple[_Three, _Three, _Three] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    translation: _Three = (0.0, 0.0, 0.0)
+    scale: _Size = 1.0
+    offset: _Three = (0.0, 0.0, 0.0)
 
 
-@dataclass(frozen=True)
-class _RecordedScene:
+class _RecordedScene(msgspec.Struct):
     """Entries of a data manager's metadata and summary; what a run lacks keeps its default."""
 
-    wavelengths_nm: _Numbers = ()
-    fwhm_nm: _Numbers | None = None
-    illuminant: _Numbers | None = None
+    wavelengths_nm: tuple[_Above0, ...] = ()
+    fwhm_nm: tuple[_Above0, ...] | None = None
+    illuminant: tuple[Annotated[float, Meta(ge=0, le=1e300)], ...] | None = None
     has_alpha: bool = False
     is_unbounded: bool = False
     has_backdrop: bool = False
-    grid_resolution: int = 64
-    pixel_size: float = 1.0
-    subpixels: int = 1
-    num_train_views: int = 1
-    num_train_pixels: int = 0
-    line_rows: tuple[int, ...] | None = None
+    grid_resolution: Annotated[int, Meta(ge=8, le=512)] = 64
+    pixel_size: _Size = 1.0
+    subpixels: Annotated[int, Meta(ge=1, le=8)] = 1
+    num_train_views: Annotated[int, Meta(ge=1)] = 1
+    num_train_pixels: Annotated[int, Meta(ge=0)] = 0
+    line_rows: tuple[Annotated[int, Meta(ge=0, le=65536)], ...] | None = None
     root: str = ""
     normalisation: _RecordedFrame | None = None
     material_names: tuple[str, ...] | None = None
-    endmembers: tuple[_Numbers, ...] | None = None
+    endmembers: tuple[tuple[_Number, ...], ...] | None = None
     has_labels: bool = False
     has_abundances: bool = False
-    input_hashes: Mapping[str, str] = field(default_factory=dict)
-    truth_hashes: Mapping[str, str] = field(default_factory=dict)
-    options: SceneOptions = SceneOptions()
-
-
-_LEAST_SIZE = 1e-12  # what is divided by less leaves float32
+    input_hashes: dict[str, str] = {}
+    truth_hashes: dict[str, str] = {}
+    options: dict[str, Any] = {}
 
 
 def check_recorded_scene(values: Mapping[str, Any]) -> None:
     """Refuse metadata or a summary that no data manager wrote. Raises ValueError, ConfigError: an entry is of the wrong
     type, or a number out of its range; KeyError, IndexError, TypeError: a sensor is damaged."""
-    known = {entry.name: values[entry.name] for entry in fields(_RecordedScene) if entry.name in values}
-    scene = config_from_json(known, _RecordedScene(), "the scene")
-    bands, normalisation = len(scene.wavelengths_nm), scene.normalisation
+    try:
+        scene = msgspec.convert(dict(values), _RecordedScene)
+    except msgspec.ValidationError as error:
+        raise ValueError(f"the scene: {error}") from error
+    config_from_json(scene.options, SceneOptions(), "the scene's options")
+    bands = len(scene.wavelengths_nm)
     rules = {
-        "wavelengths above 0 nm that increase": all(0 < a < b for a, b in pairwise(scene.wavelengths_nm)),
-        "widths above 0 nm, one a band": scene.fwhm_nm is None
-        or (len(scene.fwhm_nm) == bands and min(scene.fwhm_nm, default=0) > 0),
-        "an illuminant with a value a band, none negative": scene.illuminant is None
-        or (len(scene.illuminant) == bands and min(scene.illuminant, default=0) >= 0),
-        "endmembers with a value a band": all(len(row) == bands for row in scene.endmembers or ()),
-        "a grid_resolution of 8 to 512": 8 <= scene.grid_resolution <= 512,
-        "a pixel_size above 0": scene.pixel_size > _LEAST_SIZE,
-        "subpixels of 1 to 8": 1 <= scene.subpixels <= 8,
-        "num_train_views of at least 1": scene.num_train_views >= 1,
-        "num_train_pixels of at least 0": scene.num_train_pixels >= 0,
-        "line_rows of 0 to 65536, one a training view": scene.line_rows is None
-        or (len(scene.line_rows) == scene.num_train_views and all(0 <= n <= 65536 for n in scene.line_rows)),
+        "wavelengths that increase": all(a < b for a, b in pairwise(scene.wavelengths_nm)),
+        "a width for each band": scene.fwhm_nm is None or len(scene.fwhm_nm) == bands,
+        "an illuminant with a value for each band": scene.illuminant is None
+        or len(scene.illuminant) == bands,
+        "endmembers with a value for each band": all(len(row) == bands for row in scene.endmembers or ()),
+        "line_rows of each training view": scene.line_rows is None
+        or len(scene.line_rows) == scene.num_train_views,
         "a name for each endmember": None in (scene.material_names, scene.endmembers)
         or len(scene.material_names or ()) == len(scene.endmembers or ()),
-        "a rotation of 3 x 3 and a scale above 0": normalisation is None
-        or (normalisation.scale > _LEAST_SIZE and all(len(row) == 3 for row in normalisation.rotation)),
     }
     broken = [rule for rule, holds in rules.items() if not holds]
     for sensor in values.get("sensors", ()):

@@ -139,9 +139,30 @@ def _assemble(
     truths = [path for key, path in files if key not in _MEASURED_KEYS] + [truth.materials_path]
 
     def hashes(paths: Sequence[Path | None]) -> dict[str, str]:
-        found = [path for path in paths if path is not None]
-        return {_relative(path, root): known.get(path) or sha256_of(path) for path in found}
+        found = {
+            path.relative_to(root).as_posix() if path.is_relative_to(root) else str(path): path
+            for path in paths
+            if path is not None
+        }
+        return {name: known.get(path) or sha256_of(path) for name, path in found.items()}
 
+    frames = tuple(
+        Frame(
+            name=name,
+            cube_path=own.cube,
+            image_path=frame.files.get("file_path"),
+            label_path=frame.files.get("seg_file_path"),
+            mask_path=frame.files.get("mask_path"),
+            abundance_path=frame.files.get("abundance_file_path"),
+            sensor=own.sensor,
+        )
+        for name, frame, own in zip(
+            distinct_names([frame.paths[CUBE_KEY] for frame in entry.frames]),
+            entry.frames,
+            checked.frames,
+            strict=True,
+        )
+    )
     assert entry.wavelengths_nm is not None
     evaluated = [entry.frames[index].files for index in split.evaluation]
     return Scene(
@@ -149,7 +170,7 @@ def _assemble(
         wavelengths_nm=entry.wavelengths_nm,
         fwhm_nm=fwhm_nm,
         sensors=checked.sensors,
-        frames=_name_frames(entry, checked),
+        frames=frames,
         cameras=entry.cameras(checked.sizes, space.normalisation),
         train_indices=split.train,
         eval_indices=split.evaluation,
@@ -172,10 +193,6 @@ def _assemble(
         truth_hashes=hashes(truths),
         options=options,
     )
-
-
-def _relative(path: Path, root: Path) -> str:
-    return path.relative_to(root).as_posix() if path.is_relative_to(root) else str(path)
 
 
 def readable_name(name: str) -> str:
@@ -205,19 +222,3 @@ def distinct_names(files: Sequence[str]) -> list[str]:
         if len({name.casefold() for name in names}) == len(names):
             return names
     return [readable_name(f"{index}_{path.name}") for index, path in enumerate(paths)]
-
-
-def _name_frames(entry: SceneEntry, checked: CheckedFiles) -> tuple[Frame, ...]:
-    names = distinct_names([frame.paths[CUBE_KEY] for frame in entry.frames])
-    return tuple(
-        Frame(
-            name=name,
-            cube_path=own.cube,
-            image_path=frame.files.get("file_path"),
-            label_path=frame.files.get("seg_file_path"),
-            mask_path=frame.files.get("mask_path"),
-            abundance_path=frame.files.get("abundance_file_path"),
-            sensor=own.sensor,
-        )
-        for name, frame, own in zip(names, entry.frames, checked.frames, strict=True)
-    )

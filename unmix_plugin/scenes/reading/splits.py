@@ -38,9 +38,10 @@ def split_frames(
     if method == "lists" and not entry.split_lists:
         faults.note(FILE_NAME, Message.NO_SPLIT_LISTS)
         return Split((), ())
+    names = {_name_split(frame.paths) for frame in entry.frames}
     if method == "lists" or (method == "auto" and entry.split_lists):
         split = _by_lists(entry, faults)
-    elif method == "filename" or (method == "auto" and _have_split_names(entry)):
+    elif method == "filename" or (method == "auto" and None not in names and {"train"} < names):
         split = _by_name(entry, faults)
     else:
         split = _by_interval(entry, interval, faults)
@@ -101,11 +102,6 @@ def _name_split(paths: dict[str, str]) -> str | None:
             if match := _SPLIT_NAME.match(word):
                 return next(name for name in _SPLIT_NAMES if match.group(1).lower().startswith(name))
     return None
-
-
-def _have_split_names(entry: SceneEntry) -> bool:
-    names = [_name_split(frame.paths) for frame in entry.frames]
-    return None not in names and "train" in names and len(set(names)) > 1
 
 
 def _by_name(entry: SceneEntry, faults: Faults) -> Split:
