@@ -27,7 +27,7 @@ from unmix_plugin.scenes.demo.shading import (
     render_view,
     smooth_step,
 )
-from unmix_plugin.scenes.demo.shapes import Placement
+from unmix_plugin.scenes.demo.shapes import PlacedPrimitive
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
@@ -72,19 +72,19 @@ def write_plant(folder: Path, size: int = 72, num_views: int = 28) -> None:
         reach = 0.34 - 0.018 * number
         angle = np.deg2rad(turn + 90)
         centre = (reach * np.cos(angle), reach * np.sin(angle), height)
-        placement = Placement(
+        placement = PlacedPrimitive(
             "sphere", centre, (0.13, 0.34 - 0.014 * number, 0.035), turn_deg=turn, tilt_deg=28 + 3 * number
         )
         leaves.append(Thing(placement, Surface(one, two, tip if number % 3 == 0 else plain)))
     things = [
-        Thing(Placement("cylinder", (0, 0, -0.05), (1.05, 1.05, 0.05)), Surface(six, six, plain), ()),
+        Thing(PlacedPrimitive("cylinder", (0, 0, -0.05), (1.05, 1.05, 0.05)), Surface(six, six, plain), ()),
         Thing(
-            Placement("cylinder", (0, 0, 0.3), (0.42, 0.42, 0.3)),
+            PlacedPrimitive("cylinder", (0, 0, 0.3), (0.42, 0.42, 0.3)),
             Surface(three, five, bands_of_glaze),
             ((0, 0, 0.3, 0.4),),
         ),
-        Thing(Placement("cylinder", (0, 0, 0.605), (0.36, 0.36, 0.015)), Surface(four, four, plain)),
-        Thing(Placement("cylinder", (0, 0, 0.95), (0.03, 0.03, 0.36)), Surface(one, one, plain)),
+        Thing(PlacedPrimitive("cylinder", (0, 0, 0.605), (0.36, 0.36, 0.015)), Surface(four, four, plain)),
+        Thing(PlacedPrimitive("cylinder", (0, 0, 0.95), (0.03, 0.03, 0.36)), Surface(one, one, plain)),
         *leaves,
     ]
     angles = np.arange(num_views) * 2 * np.pi * 5 / num_views  # five turns, the camera higher in each
@@ -120,7 +120,9 @@ def write_painting(folder: Path, size: int = 72, num_views: int = 24) -> None:
     def field(
         x: float, y: float, width: float, height: float, first: str, second: str, blend: Blend = plain
     ) -> Thing:
-        return Thing(Placement("box", (x, y, 0.1), (width, height, 0.012)), Surface(first, second, blend))
+        return Thing(
+            PlacedPrimitive("box", (x, y, 0.1), (width, height, 0.012)), Surface(first, second, blend)
+        )
 
     def half(points: np.ndarray) -> np.ndarray:
         return (points[:, 0] + 0.25 * np.sin(7 * points[:, 1]) > 0.1).astype(points.dtype)
@@ -128,12 +130,17 @@ def write_painting(folder: Path, size: int = 72, num_views: int = 24) -> None:
     def waves(points: np.ndarray) -> np.ndarray:
         return smooth_step(np.sin(6 * points[:, 0] + 2 * np.sin(3 * points[:, 1])), -0.5, 0.5)
 
-    ball = Thing(Placement("sphere", (0.42, -0.32, 0.12), (0.17, 0.17, 0.05)), Surface(two, three, waves))
+    ball = Thing(
+        PlacedPrimitive("sphere", (0.42, -0.32, 0.12), (0.17, 0.17, 0.05)), Surface(two, three, waves)
+    )
     things = [
-        Thing(Placement("box", (0, 0, 0), (1.0, 0.75, 0.09)), Surface(one, one, plain)),
+        Thing(PlacedPrimitive("box", (0, 0, 0), (1.0, 0.75, 0.09)), Surface(one, one, plain)),
         field(0, 0.3, 0.86, 0.32, five, six, half),
         field(-0.3, -0.38, 0.56, 0.26, four, three, waves),
-        Thing(Placement("cylinder", (-0.55, 0.38, 0.11), (0.17, 0.17, 0.014)), Surface(three, three, plain)),
+        Thing(
+            PlacedPrimitive("cylinder", (-0.55, 0.38, 0.11), (0.17, 0.17, 0.014)),
+            Surface(three, three, plain),
+        ),
         ball,
     ]
     count = np.arange(num_views)
