@@ -97,7 +97,7 @@ platforms: | $(BIN)/python
 	@set -e; for system in linux macos windows; do for python in 3.10 3.14; do \
 	  echo "wheels for Python $$python on $$system"; \
 	  MACOSX_DEPLOYMENT_TARGET=14.0 $(BIN)/uv pip compile --quiet --only-binary :all: --python-platform $$system \
-	    --python-version $$python --constraint constraints.txt --extra captures --extra sfm --extra lmrm \
+	    --python-version $$python --constraint constraints.txt --extra captures --extra sfm --extra las --extra lmrm \
 	    --extra reference --extra tensorboard --extra docs --output-file /dev/null pyproject.toml; done; done
 
 wheel: | $(BIN)/python

@@ -47,7 +47,7 @@ def columns(path):
 def test_points_are_where_the_source_says(tmp_path):
     points = seen_surface(SCENE, ALL_ROUND, 6_000).points()
     for name, frame in (("near", FRAME), ("far", FAR)):
-        _write_point_cloud(tmp_path / name, points, 300, SCENE, frame)
+        _write_point_cloud([tmp_path / name], points, 300, SCENE, frame)
     near, far = columns(tmp_path / "near"), columns(tmp_path / "far")
     assert near.dtype == np.float32
     assert_close(far, source_of(near.astype(np.float64)))

@@ -1,5 +1,7 @@
 """Points of the surface: cleaned and thinned, with normals and scores, in a file."""
 
+import sys
+from dataclasses import replace
 from unittest.mock import MagicMock
 
 import numpy as np
@@ -132,7 +134,7 @@ def test_what_cannot_be_computed_or_shows_nothing_is_refused(points, tmp_path):
             export(MagicMock(spec=Job, materials=SCENE.materials), PointCloud(num_points=count))
     nothing = points.select(torch.zeros(len(points), dtype=torch.bool))
     with pytest.raises(RunError, match="no ray of the run's cameras ends on a surface"):
-        _write_point_cloud(tmp_path / "points.ply", nothing, 800, SCENE, FRAME)
+        _write_point_cloud([tmp_path / "points.ply"], nothing, 800, SCENE, FRAME)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -147,7 +149,7 @@ def points():
 @pytest.fixture(scope="module")
 def cloud(points, tmp_path_factory):
     path = tmp_path_factory.mktemp("cloud") / "points.ply"
-    count = _write_point_cloud(path, points, 800, SCENE, FRAME)
+    count = _write_point_cloud([path], points, 800, SCENE, FRAME)
     return PlyData.read(path), count
 
 
@@ -196,7 +198,7 @@ def test_indices_targets_and_nearest_spectra_are_written_for_each_point(points, 
     asked += [f"library:{tmp_path / 'two.csv'}<0.1"]
     scores = _require_point_scores(asked, SCENE.bands)
     path = tmp_path / "points.ply"
-    count = _write_point_cloud(path, points, 300, SCENE, FRAME, scores)
+    count = _write_point_cloud([path], points, 300, SCENE, FRAME, scores)
     ply = PlyData.read(path)
     written = [one.name for one in ply["vertex"].properties[-4:]]
     assert written == ["index_1", "index_pri", "target_1", "library_1"]
@@ -214,3 +216,43 @@ def test_indices_targets_and_nearest_spectra_are_written_for_each_point(points, 
     assert "index_1: index:r650/r500, formula r650/r500" in ply.comments[-6]
     assert ply.comments[-6].endswith("of radiance, since the scene's light is unknown")
     assert ply.comments[-2:] == ["library_1 0: moss", "library_1 1: red clay"]
+
+
+@pytest.mark.parametrize("suffix", ["las", "laz"])
+def test_las_has_the_numbers_of_ply_with_all_bands_and_abundances(suffix, points, tmp_path):
+    laspy = pytest.importorskip("laspy")
+    if suffix == "laz":
+        pytest.importorskip("lazrs")
+    paths = [tmp_path / "points.ply", tmp_path / f"points.{suffix}"]
+    light = torch.linspace(0.5, 1, len(BANDS))
+    lit = replace(SCENE, materials=replace(SCENE.materials, light=light))
+    count = _write_point_cloud(paths, points, 300, lit, FRAME, (), "reflectance")
+    ply, las = PlyData.read(str(paths[0]))["vertex"].data, laspy.read(paths[1])
+    assert len(las.points) == len(ply) == count
+    position = np.stack([ply[axis] for axis in "xyz"], axis=1)
+    np.testing.assert_allclose(las.xyz, position, atol=1e-6 * np.ptp(position))
+    np.testing.assert_array_equal(np.asarray(las.red) // 257, ply["red"])
+    names = {name for name in ply.dtype.names if name not in ("x", "y", "z", "red", "green", "blue")}
+    assert set(las.point_format.extra_dimension_names) == names
+    bands = [f"reflectance_{nm:g}nm" for nm in BANDS.centers_nm]
+    assert set(bands) < names
+    for name in names:
+        np.testing.assert_array_equal(np.asarray(las[name]), ply[name])
+    shares = np.stack([ply[name] for name in ply.dtype.names if name.startswith("abundance_")], axis=1)
+    scene = lit.materials.endmembers.numpy() / light.numpy()
+    found = np.stack([ply[name] for name in bands], axis=1)
+    angles = (
+        (found * (shares @ scene)).sum(1)
+        / np.linalg.norm(found, axis=1)
+        / np.linalg.norm(shares @ scene, axis=1)
+    )
+    assert angles.min() > 0.9999  # reflectance is the mixture, but for its shading
+
+
+def test_reflectance_of_points_needs_a_light_and_formats_their_package(tmp_path, monkeypatch):
+    job = MagicMock(spec=Job, materials=replace(SCENE.materials, light=None), folder=tmp_path)
+    with pytest.raises(ConfigError, match="--spectra reflectance needs the light of the scene"):
+        export(job, PointCloud(spectra="reflectance"))
+    monkeypatch.setitem(sys.modules, "laspy", None)
+    with pytest.raises(ConfigError, match=r"isn't installed .* pip install"):
+        export(job, PointCloud(formats=("las",)))

@@ -1,4 +1,4 @@
-"""The scene's surface as a cloud of points with their mixture, spectral indices and scores of targets: PLY.
+"""The surface as a cloud of points with mixture, spectral indices, scores of targets, and spectra: PLY, LAS, LAZ.
 
 Points are the ends of rays of the run's own cameras where nearly all of a ray ends, and where the cameras agree on it;
 lone points are left out, and the rest is thinned evenly. Normals are those of planes through the neighbours.
@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -19,6 +20,7 @@ from jaxtyping import Bool, Float, Float32, Int64
 from torch import Tensor
 
 from unmix_plugin.errors import ConfigError, RunError, counted
+from unmix_plugin.formats.las import require_laspy, write_las
 from unmix_plugin.formats.meshes import write_ply
 from unmix_plugin.products.mesh import xyz_columns
 from unmix_plugin.products.product import Job
@@ -173,28 +175,40 @@ def export(job: Job, asked: PointCloud) -> list[Path]:
     scores = _require_point_scores(asked.outputs, materials.bands, materials.is_lit)
     for score in scores:
         find_output(score.output, materials)  # which refuses libraries through another sensor
-    path = job.folder / "points.ply"
-    job.claim([path])
+    if asked.spectra == "reflectance" and not materials.is_light_known:
+        raise ConfigError(
+            "--spectra reflectance needs the light of the scene, which is not known; ask for --spectra radiance"
+        )
+    if {"las", "laz"} & set(asked.formats):
+        require_laspy("laz" in asked.formats)
+    paths = [job.folder / f"points.{kind}" for kind in dict.fromkeys(asked.formats)]
+    if not paths:
+        raise ConfigError("--formats names no format; choose ply, las or laz")
+    job.claim(paths)
     cameras = [view.camera for view in job.views("all")]
     surface = SeenSurface(job.scene, _RAYS_PER_POINT * count, cameras, job.follow)
     with job.working("cleaning and thinning the points"):
-        written = _write_point_cloud(path, surface.points(), count, job.scene, job.frame, scores)
+        written = _write_point_cloud(
+            paths, surface.points(), count, job.scene, job.frame, scores, asked.spectra
+        )
     job.say(counted(written, "point"))
-    return [path]
+    return paths
 
 
 def _write_point_cloud(
-    path: Path,
+    paths: Sequence[Path],
     points: SurfacePoints,
     num_points: int,
     scene: TrainedScene,
     frame: Normalisation,
     scores: Sequence[_PointScore] = (),
+    spectra: Literal["none", "radiance", "reflectance"] = "none",
 ) -> int:
-    """Write at most so many points, binary, in world coordinates, and say how many.
+    """Write at most so many points, binary, in world coordinates, to each file in the format of its suffix; say how
+    many.
 
     x y z (float32, float64 where coordinates are large), nx ny nz (float32), red green blue (uint8, sRGB of the diffuse
-    spectrum), material (uint8), every abundance and every score (float32).
+    spectrum), material (uint8), every abundance, every score and the diffuse spectrum if asked for (float32).
     """
     materials = scene.materials
     points = points.select(torch.from_numpy(~_is_outlier(points.positions.numpy())))
@@ -215,8 +229,27 @@ def _write_point_cloud(
         **xyz_columns(turned, "n"),
         **looks.properties(),
         **{score.property: score.values(diffuse, materials.light) for score in scores},
+        **_band_columns(diffuse, materials, spectra),
     }
     comments = looks.comments("surface points of an unmix-nerf run")
     comments += [comment for score in scores for comment in score.comments(materials)]
-    write_ply(path, vertices, comments=comments)
+    if spectra != "none":
+        comments.append(f"{spectra}_NUMBERnm: the diffuse spectrum at each band")
+    for path in paths:
+        if path.suffix in (".las", ".laz"):
+            write_las(path, vertices, comments)
+        else:
+            write_ply(path, vertices, comments=comments)
     return len(chosen)
+
+
+def _band_columns(
+    diffuse: Float[Tensor, "P B"], materials: Materials, spectra: Literal["none", "radiance", "reflectance"]
+) -> dict[str, Float32[np.ndarray, " P"]]:
+    """A column for each band, called such as `reflectance_450nm`; of reflectance NaN where the light is dark."""
+    if spectra == "none":
+        return {}
+    light = materials.light if spectra == "reflectance" else None
+    values = seen_reflectance(diffuse, torch.ones(len(diffuse), dtype=diffuse.dtype), light).numpy()
+    names = [f"{spectra}_{nm:.10g}nm".replace(".", "_") for nm in materials.bands.centers_nm]
+    return {name: values[:, index].astype(np.float32) for index, name in enumerate(names)}

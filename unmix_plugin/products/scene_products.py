@@ -104,10 +104,14 @@ class Page(_ComparedProduct):
 @dataclass(frozen=True)
 class PointCloud(Product):
     """The surface as points: points.ply with position and normal in the scene's world coordinates, colour, material and
-    every abundance of each point, and with --outputs more numbers."""
+    every abundance of each point, with --spectra all bands, and with --outputs more numbers."""
 
     num_points: int = 100_000
     """Most points to write; they cover what the run's cameras see evenly."""
+    spectra: Literal["none", "radiance", "reflectance"] = "none"
+    """Whether each point has its diffuse spectrum, a number for each band."""
+    formats: tuple[Literal["ply", "las", "laz"], ...] = ("ply",)
+    """LAS and LAZ need the packages laspy and lazrs."""
     outputs: tuple[str, ...] = ()
     """Numbers to add to each point: spectral indices, targets, nearest known spectra and absorptions, as in index:ndvi
     target:ace:paint.csv library:angle:mine.csv absorption:centre:650-700."""
