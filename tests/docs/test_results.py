@@ -1,13 +1,14 @@
 """Results that pages cite: each names the clean revision that it was measured at, and what it depends on is known."""
 
 import importlib.util
+import json
 import os
 import subprocess
 import sys
 
 import pytest
 
-from tests.docs.pages import ROOT
+from tests.docs.pages import ROOT, text_of
 
 
 def module_of(path):
@@ -22,13 +23,13 @@ def module_of(path):
 
 DEPENDS = module_of(ROOT / "benchmarks/_depends.py")
 CHECK = module_of(ROOT / "scripts/check_results.py")
+TABLE = module_of(ROOT / "scripts/results_table.py")
 TO_MEASURE_AGAIN = {
     "confidence": "python benchmarks/confidence.py",
     "found_poses": "python benchmarks/found_poses.py --folder DIR",
     "gpu": "python benchmarks/gpu.py",
     "neumatex_prior": "python benchmarks/neumatex_prior.py",
     "quality": "python benchmarks/quality.py",
-    "unmixing_2d-samson": "python benchmarks/unmixing_2d.py samson_dataset.mat --endmembers 3 --seeds 5 --json",
 }
 """Results that are not clean, each with the command that measures it again. No other may join them."""
 
@@ -53,6 +54,27 @@ def test_every_benchmark_states_what_it_measures(path):
 def test_every_result_is_of_a_benchmark_that_is_here():
     stems = {path.stem for path in (ROOT / "benchmarks/results").glob("*.md")} - {"tried"}
     assert {DEPENDS.benchmark_of(stem) for stem in stems} <= set(DEPENDS.DEPENDS_ON)
+
+
+def test_readme_shows_the_results_that_are_committed():
+    report = json.loads((ROOT / "benchmarks/results/quality.json").read_text(encoding="utf-8"))
+    assert TABLE.with_results(text_of("README.md"), report) == text_of("README.md")
+
+
+def test_of_drawn_scenes_the_mean_and_the_worst_are_shown():
+    figures = {
+        "bands": 21,
+        "psnr": 30.0,
+        "psnr_matter": 28.0,
+        "sam": 0.02,
+        "miou": 0.8,
+        "abundance_rmse": 0.1,
+    }
+    worse = figures | {"psnr": 20.0, "sam": 0.06, "miou": 0.4}
+    measured = {f"unseen-{k}": {"metrics": values} for k, values in enumerate((figures, worse), start=1)}
+    mean, worst = TABLE.table(measured).splitlines()[-2:]
+    assert mean == "| 2 drawn scenes: mean | 21 | 25.0 dB | 28.0 dB | 0.040 rad | 0.60 | 0.100 |"
+    assert worst == "| and the worst of each | 21 | 20.0 dB | 28.0 dB | 0.060 rad | 0.40 | 0.100 |"
 
 
 WITHOUT_SCENES = {
