@@ -10,14 +10,14 @@ from tests.method_factory import CAMERA, CONFIG, NUM_BANDS, make_model, make_ray
 from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.model import UnmixModel
 from unmix_plugin.operators.compositing import volume_weights_twin
-from unmix_plugin.rendering.renderer import _points_of
+from unmix_plugin.rendering.renderer import points_of
 from unmix_plugin.sensors.batches import from_batch
 
 
 def naive_spectra(model: UnmixModel, rays) -> torch.Tensor:
     """The paper's sum: a spectrum of B bands at every sample, composited ray by ray."""
     samples = model.renderer.march(rays.origins, rays.directions, torch.zeros(len(rays))).samples()
-    positions, along = _points_of(samples, rays)
+    positions, along = points_of(samples, rays)
     densities, features = model.field.get_density(positions)
     outputs = model.field.get_outputs(positions, along, features)
     per_sample = torch.einsum("sk,kb->sb", outputs["scaled_abundances"], model.endmembers)

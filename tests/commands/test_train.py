@@ -16,7 +16,7 @@ import unmix_plugin
 from tests.commands.running import SMALL_METHOD, done, refused, run, run_of
 from tests.formats.cubes import full_disk
 from unmix_plugin.commands.train import parse, train
-from unmix_plugin.commands.training import _remark_on_passes, _remarks
+from unmix_plugin.commands.training import remark_on_passes, remarks_on_course
 from unmix_plugin.engine import registry
 from unmix_plugin.engine.runs.load_run import load_config, load_model
 from unmix_plugin.engine.training.trainer import Trainer
@@ -286,7 +286,7 @@ def remarks_on(folder, *quarters: float | None, kept=slice(None), **last) -> lis
     lines = [*lines[:-1], {**lines[-1], **last}][kept]
     lines += [{"step": 1000, "split": "eval_all", "psnr": 20.0}]
     (folder / "metrics.jsonl").write_text("\n".join(json.dumps(line) for line in lines) + "\n")
-    return _remarks(folder / "metrics.jsonl")
+    return remarks_on_course(folder / "metrics.jsonl")
 
 
 SETTLED = (1.0, 0.4, 0.2, 0.16)
@@ -312,8 +312,8 @@ def test_what_a_training_did_not_reach_is_remarked(tmp_path, quarters, last, sai
 
 
 def test_few_rays_a_pixel_are_remarked_and_losses_that_say_nothing_are_not(tmp_path):
-    assert "0.8 rays for each training pixel" in _remark_on_passes(80_000, 100_000)[0]
-    assert _remark_on_passes(900_000, 100_000) == _remark_on_passes(80_000, 0) == []
+    assert "0.8 rays for each training pixel" in remark_on_passes(80_000, 100_000)[0]
+    assert remark_on_passes(900_000, 100_000) == remark_on_passes(80_000, 0) == []
     assert remarks_on(tmp_path, *HARDLY_FELL, kept=slice(-5, None)) == remarks_on(tmp_path, *4 * [None]) == []
     (tmp_path / "cut.jsonl").write_text('{"step": 1')
-    assert _remarks(tmp_path / "cut.jsonl") == _remarks(tmp_path / "missing.jsonl") == []
+    assert remarks_on_course(tmp_path / "cut.jsonl") == remarks_on_course(tmp_path / "missing.jsonl") == []

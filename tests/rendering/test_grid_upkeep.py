@@ -6,7 +6,7 @@ import torch
 
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.operators.occupancy import skip_distances
-from unmix_plugin.rendering.grid_upkeep import _occupied_density
+from unmix_plugin.rendering.grid_upkeep import occupied_density
 from unmix_plugin.rendering.renderer import VolumeRenderer
 
 CELLS = 10
@@ -30,5 +30,5 @@ RENDERER = VolumeRenderer(
     ],
 )
 def test_a_cell_is_occupied_from_an_opacity_along_a_sample_or_across_it_the_short_way(changes, way, opacity):
-    density = _occupied_density(replace(RENDERER, **changes), CELLS)
+    density = occupied_density(replace(RENDERER, **changes), CELLS)
     assert 1 - math.exp(-density * way) == pytest.approx(opacity)

@@ -165,7 +165,7 @@ def test_samples_found_from_the_front_are_those_of_all(monkeypatch, smallest_wei
         field.table.normal_(std=3.0, generator=torch.Generator().manual_seed(2))
         samples = samples_of(renderer, bundle)
         found = visible_samples(field, samples, bundle, step=step, smallest_weight=smallest_weight)
-        encoded = field.encode(rendering._points_of(samples, bundle)[0])
+        encoded = field.encode(rendering.points_of(samples, bundle)[0])
         densities, features = field.density_of(encoded)
         keep = volume_weights(densities * step, samples.packed_info) > smallest_weight
     assert torch.equal(found.samples.t, samples.t[keep])

@@ -189,8 +189,8 @@ def finish(trainer: Trainer, console: Console) -> None:
     if scene is not None:  # remarks name settings of spectral methods
         _compare_views(trainer, scene, console)
         num_pixels = int(data.metadata().get("num_train_pixels", 0))
-        few = _remark_on_passes(record.total_rays, num_pixels)
-        for remark in [*_remarks(trainer.run.metrics_path), *few]:
+        few = remark_on_passes(record.total_rays, num_pixels)
+        for remark in [*remarks_on_course(trainer.run.metrics_path), *few]:
             say(console, remark)
 
 
@@ -237,7 +237,7 @@ _FEW_PASSES = 3
 """Rays for each training pixel below which fine detail is still being learnt."""
 
 
-def _remarks(metrics_path: Path) -> list[str]:
+def remarks_on_course(metrics_path: Path) -> list[str]:
     """Sentences on a training's `metrics.jsonl`, whose `loss` is None where it was not finite."""
     from unmix_plugin.engine.training.progress import read_metrics
 
@@ -282,7 +282,7 @@ def _remarks(metrics_path: Path) -> list[str]:
     return found
 
 
-def _remark_on_passes(num_rays: int, num_pixels: int) -> list[str]:
+def remark_on_passes(num_rays: int, num_pixels: int) -> list[str]:
     """A remark if the pixels of the training views (0: not known) were seen so rarely that more rays show more."""
     if num_pixels == 0 or num_rays >= _FEW_PASSES * num_pixels:
         return []

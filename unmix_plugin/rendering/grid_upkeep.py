@@ -58,7 +58,7 @@ def update_grid(
     begins_coarsely = renderer.is_unbounded and progress < _FIRST_CELLS_UNTIL
     grid.update(
         lambda points: field.get_density(space.from_unit(points))[0],
-        threshold=_occupied_density(renderer, max(grid.occupied.shape)),
+        threshold=occupied_density(renderer, max(grid.occupied.shape)),
         decay=_GRID_DECAY,
         num_cells=_PROBED_CELLS,
         generator=torch.Generator().manual_seed(int(drawn)),
@@ -67,7 +67,7 @@ def update_grid(
     )
 
 
-def _occupied_density(renderer: VolumeRenderer, num_cells: int) -> float:
+def occupied_density(renderer: VolumeRenderer, num_cells: int) -> float:
     """Density per model unit from which a cell counts as occupied, of which so many lie along an edge of the grid."""
     by_sample = -math.log1p(-_OCCUPIED_OPACITY) / renderer.step
     across = -math.log1p(-_OPACITY_ACROSS) / (float(renderer.space.shortest_edge) / num_cells)

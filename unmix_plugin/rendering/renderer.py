@@ -83,7 +83,7 @@ def visible_samples(
         rays, chosen, _ = packed_rows(starts + first, wanted)
         if len(chosen) == 0 and evaluated:
             break
-        positions, _ = _points_of(samples.rows(chosen), ray_bundle)
+        positions, _ = points_of(samples.rows(chosen), ray_bundle)
         encoded = field.encode(positions)
         densities, features = field.density_of(encoded)
         evaluated.append(EvaluatedSamples(positions, encoded, densities, features))
@@ -96,7 +96,7 @@ def visible_samples(
     return VisibleSamples(samples.select(keep), rows[keep], evaluated)
 
 
-def _points_of(
+def points_of(
     samples: PackedSamples, ray_bundle: RayBundle
 ) -> tuple[Float[Tensor, "S 3"], Float[Tensor, "S 3"]]:
     """Positions of samples and the directions they are seen along."""
@@ -175,7 +175,7 @@ class VolumeRenderer:
             field, samples, ray_bundle, step=self.step, smallest_weight=self.smallest_weight
         )
         kept = seen.samples
-        positions, along = _points_of(kept, ray_bundle)
+        positions, along = points_of(kept, ray_bundle)
         if torch.is_grad_enabled():
             encoded = seen.of([part.encoded for part in seen.evaluated])
             densities, features = field.density_of(field.encode(positions, encoded))

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from torch.testing import assert_close
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.key_poses import KeyPoses, _rotation_vector, rotation_matrix
+from unmix_plugin.engine.geometry.key_poses import KeyPoses, rotation_matrix, rotation_vector
 
 WIDTH, HEIGHT = 12, 40
 angles = st.tuples(*[st.floats(-1.6, 1.6)] * 3)
@@ -45,7 +45,7 @@ def keys(distortion: float = 0.0, p1: float = 0.0) -> Cameras:
 @given(angles)
 def test_the_vector_of_a_rotation_gives_it_back(turn):
     w = torch.tensor(turn, dtype=torch.float64)
-    assert_close(_rotation_vector(rotation_matrix(w)), w, atol=1e-9, rtol=0)
+    assert_close(rotation_vector(rotation_matrix(w)), w, atol=1e-9, rtol=0)
     assert_close(rotation_matrix(w) @ rotation_matrix(-w), torch.eye(3).double(), atol=1e-12, rtol=0)
     assert_close(rotation_matrix(1e-7 * w)[2, 1], 1e-7 * w[0], atol=1e-12, rtol=0)  # turns as the thumb says
 

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.testing import assert_close
 
-from unmix_plugin.engine.geometry.space import RayBundle, SceneBox, UnitSpace, _contract, _uncontract
+from unmix_plugin.engine.geometry.space import RayBundle, SceneBox, UnitSpace, contract, uncontract
 
 
 def make_bundle(count: int) -> RayBundle:
@@ -77,20 +77,20 @@ POINTS = st.lists(st.floats(-100, 100, width=32), min_size=3, max_size=3).map(to
 @given(POINTS, POINTS)
 def test_contraction_brings_points_nearer_and_is_continuous(a, b):
     """Its greatest stretch is 1, inside the inner cube and across its faces."""
-    moved = (_contract(a.double()) - _contract(b.double())).abs().amax()
+    moved = (contract(a.double()) - contract(b.double())).abs().amax()
     assert moved <= 2 * (a.double() - b.double()).abs().amax() + 1e-12
-    near = _contract(a.double() * (1 + 1e-9)) - _contract(a.double())
+    near = contract(a.double() * (1 + 1e-9)) - contract(a.double())
     assert near.abs().amax() < 1e-8
 
 
 @given(POINTS)
 def test_contraction_stays_below_two_leaves_the_inner_cube_alone_and_is_undone(point):
     point = point.double()
-    found = _contract(point)
+    found = contract(point)
     assert found.abs().amax() < 2
-    assert_close(_uncontract(found), point, rtol=1e-6, atol=1e-9)
-    assert torch.equal(_contract(point / 100), point / 100)
-    far = _contract(torch.tensor([1e6, 0.0, 5e5]))
+    assert_close(uncontract(found), point, rtol=1e-6, atol=1e-9)
+    assert torch.equal(contract(point / 100), point / 100)
+    far = contract(torch.tensor([1e6, 0.0, 5e5]))
     assert_close(far, torch.tensor([2.0, 0.0, 1.0]), rtol=0, atol=1e-5)  # the end of a direction
 
 

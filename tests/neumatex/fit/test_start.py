@@ -13,10 +13,10 @@ from tests.neumatex.surfaces import generator, unit
 from tests.products.ball_model import RADIUS, ball_scene
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.neumatex.fit import data_manager
-from unmix_plugin.neumatex.fit.data_manager import _view_arrays
+from unmix_plugin.neumatex.fit.data_manager import view_arrays
 from unmix_plugin.neumatex.fit.model import prior_distance
 from unmix_plugin.neumatex.fit.object_scene import load_object
-from unmix_plugin.neumatex.fit.start import _RunMaterials, start_plain, views_of
+from unmix_plugin.neumatex.fit.start import RunMaterials, start_plain, views_of
 from unmix_plugin.neumatex.tracing.families import PbrFamily
 from unmix_plugin.neumatex.tracing.neural import NeuralFamily
 from unmix_plugin.neumatex.tracing.surface import Triplane, TriplaneSurface
@@ -39,7 +39,7 @@ def test_theprior_distance_counts_each_parameter_by_its_expected_error():
 def test_views_for_a_prior_are_the_training_views_thinned_out(tmp_path, monkeypatch):
     scene = load_object(write_object(tmp_path / "ball"))
     monkeypatch.setattr(data_manager, "LONGEST_EDGE_PX", 12)
-    views = views_of(_view_arrays(scene))
+    views = views_of(view_arrays(scene))
     assert len(views.pictures) == len(scene.split.train) == 5
     assert views.pictures[0].shape == (12, 12, 3)
     whole, thin = scene.pictures.cameras[list(scene.split.train)], views.cameras
@@ -57,13 +57,13 @@ def test_views_for_a_prior_are_of_frame_cameras_alone(tmp_path):
             keys = [{"row": row, "transform_matrix": pose(row / SIZE).tolist()} for row in (0, SIZE - 1)]
             frame |= {"transform_matrix": None, "key_poses": keys}
         path.write_text(json.dumps(content))
-        arrays = _view_arrays(load_object(path.parent))
+        arrays = view_arrays(load_object(path.parent))
         assert sum(name.endswith("_pose") for name in arrays) == left
     with pytest.raises(ConfigError, match=r"choose --pipeline\.model\.prior none"):
         views_of(arrays)
 
 
-RUN = _RunMaterials(Path("run"), ball_scene())
+RUN = RunMaterials(Path("run"), ball_scene())
 TURN = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 SCALE, SHIFT = 0.5, np.array([0.3, -0.1, 0.2])
 

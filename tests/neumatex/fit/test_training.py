@@ -28,7 +28,7 @@ from unmix_plugin.neumatex.fit import data_manager, start
 from unmix_plugin.neumatex.fit.data_manager import ObjectDataManagerConfig
 from unmix_plugin.neumatex.fit.model import NeumatexModel, unbiased_squared_error
 from unmix_plugin.neumatex.fit.settings import NeumatexModelConfig
-from unmix_plugin.neumatex.fit.start import _as_bright
+from unmix_plugin.neumatex.fit.start import as_bright_as_seen
 from unmix_plugin.neumatex.fit.trained_object import TrainedObject
 from unmix_plugin.neumatex.tracing.families import SpectralFamily
 from unmix_plugin.scenes.scene import Normalisation
@@ -296,8 +296,8 @@ def test_mixed_pixels_do_not_make_dark_endmembers_brighter_nor_bright_ones_darke
     share[:200], share[200:400] = 0.0, 1.0  # few show one material alone
     pixels = torch.cat([share, 1 - share], dim=1) @ DARK_AND_BRIGHT
     purity = unit(pixels) @ unit(DARK_AND_BRIGHT).T
-    assert_close(_as_bright(unit(DARK_AND_BRIGHT), pixels, purity), DARK_AND_BRIGHT, rtol=1e-3, atol=0)
-    found = _as_bright(DARK_AND_BRIGHT, 5 * DARK_AND_BRIGHT, torch.eye(2))
+    assert_close(as_bright_as_seen(unit(DARK_AND_BRIGHT), pixels, purity), DARK_AND_BRIGHT, rtol=1e-3, atol=0)
+    found = as_bright_as_seen(DARK_AND_BRIGHT, 5 * DARK_AND_BRIGHT, torch.eye(2))
     assert float(found.max()) <= 1
     assert_close(unit(found), unit(DARK_AND_BRIGHT))
 

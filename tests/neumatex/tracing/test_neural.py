@@ -14,7 +14,7 @@ from tests.neumatex.surfaces import eye_directions, numbers
 from tools.train_decoder import DecoderTraining, draw_materials, response_error, train, write_weights
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.neumatex.tracing.families import LayeredFamily
-from unmix_plugin.neumatex.tracing.neural import SHIPPED, Decoder, Encoder, NeuralFamily, _read_weights
+from unmix_plugin.neumatex.tracing.neural import SHIPPED, Decoder, Encoder, NeuralFamily, read_weights
 
 FAMILY = NeuralFamily()
 
@@ -56,14 +56,14 @@ def test_the_record_belongs_to_the_shipped_file():
     assert record["sha256"] == hashlib.sha256(data).hexdigest()
     assert record["bytes"] == len(data) < 1_000_000
     DecoderTraining(**record["training"])  # every setting is still one
-    decoder, encoder = _read_weights()
+    decoder, encoder = read_weights()
     assert not any(parameter.requires_grad for parameter in [*decoder.parameters(), *encoder.parameters()])
 
 
 def test_what_is_written_is_read_back_and_other_weights_are_refused_with_the_reason(tmp_path: Path):
     path, decoder, latents = tmp_path / "w.safetensors", Decoder(), torch.rand(5, 6)
     write_weights(path, decoder, Encoder(), {})
-    assert_close(_read_weights(path)[0].numbers(latents), decoder.numbers(latents))
+    assert_close(read_weights(path)[0].numbers(latents), decoder.numbers(latents))
     for write, said in (
         (lambda: write_weights(path, Decoder(width=7), Encoder(), {}), r"size mismatch for decoder\.hidden"),
         (lambda: path.write_bytes(safetensors.torch.save({"other": torch.zeros(2)})), "Missing key"),
@@ -71,4 +71,4 @@ def test_what_is_written_is_read_back_and_other_weights_are_refused_with_the_rea
     ):
         write()
         with pytest.raises(ConfigError, match=said):
-            _read_weights(path)
+            read_weights(path)

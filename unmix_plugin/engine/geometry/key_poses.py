@@ -94,7 +94,7 @@ class KeyPoses:
     def _turns(self) -> Float[Tensor, "M 3"]:
         """Rotation vector from each key pose to the next, in its own axes."""
         rotations = self.poses[:, :, :3].double()
-        turns = _rotation_vector(rotations.transpose(1, 2) @ rotations.roll(-1, 0))
+        turns = rotation_vector(rotations.transpose(1, 2) @ rotations.roll(-1, 0))
         return turns.to(self.poses)
 
     def to_json(self) -> dict[str, Any]:
@@ -202,7 +202,7 @@ def rotation_matrix(w: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3 3"]:
     return torch.eye(3, dtype=w.dtype, device=w.device) + first * cross + second * (cross @ cross)
 
 
-def _rotation_vector(matrix: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n 3"]:
+def rotation_vector(matrix: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n 3"]:
     """The inverse of `rotation_matrix` for angles below pi."""
     skew = 0.5 * (matrix - matrix.transpose(-1, -2))
     axis = torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], dim=-1)

@@ -117,22 +117,22 @@ _SPAN = 4.0
 """Edge of the contracted world in units of u."""
 
 
-def _contract(points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
+def contract(points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
     """All of space into the cube from -2 to 2; points of the cube from -1 to 1 stay where they are."""
     radius = points.abs().amax(dim=-1, keepdim=True).clamp(min=1.0)
     return points * ((2.0 - 1.0 / radius) / radius)
 
 
-def _uncontract(points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
-    """The inverse of `_contract`; points on or beyond the faces of its cube are taken for ones just inside."""
+def uncontract(points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
+    """The inverse of `contract`; points on or beyond the faces of its cube are taken for ones just inside."""
     inside = points.clamp(-2.0 + 1e-6, 2.0 - 1e-6)
     radius = inside.abs().amax(dim=-1, keepdim=True).clamp(min=1.0)
     return inside / (radius * (2.0 - radius))
 
 
 def contracted_unit(points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
-    """`_contract`, with its cube scaled to the unit cube."""
-    return _contract(points) / _SPAN + 0.5
+    """`contract`, with its cube scaled to the unit cube."""
+    return contract(points) / _SPAN + 0.5
 
 
 @dataclass(frozen=True)
@@ -167,7 +167,7 @@ class UnitSpace:
         """The inverse of `to_unit`."""
         if not self.is_unbounded:
             return points * self.box.size + self.box.aabb[0]
-        return _uncontract((points - 0.5) * _SPAN) * self.half_edge + self.box.aabb.mean(dim=0)
+        return uncontract((points - 0.5) * _SPAN) * self.half_edge + self.box.aabb.mean(dim=0)
 
     def contains(self, points: Float[Tensor, "*points 3"]) -> Tensor:
         """Points that are modelled: those in the box, or all; bool (*points)."""

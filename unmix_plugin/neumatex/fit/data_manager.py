@@ -173,7 +173,7 @@ class ObjectDataManager(DataManager):
         arrays = {"vertices": mesh.vertices, "faces": mesh.faces, "normals": mesh.normals, "uv": mesh.uv}
         arrays["light_map"] = light.image
         buffers = {name: array.numpy() for name, array in arrays.items() if array is not None}
-        return buffers | (_view_arrays(self.object) if self.object.lamp is None else self._pixel_arrays())
+        return buffers | (view_arrays(self.object) if self.object.lamp is None else self._pixel_arrays())
 
     def summary(self) -> dict[str, Any]:
         """Files, splits, normalisation, hashes, and how long a unit is where that is known."""
@@ -269,7 +269,7 @@ def _sees_mesh(ray_mesh: RayMesh, camera: Cameras) -> Bool[Tensor, "H W"]:
     return seen.reshape(camera.height, camera.width)
 
 
-def _view_arrays(scene: ObjectScene) -> dict[str, np.ndarray]:
+def view_arrays(scene: ObjectScene) -> dict[str, np.ndarray]:
     """Training views of frame cameras, which a prior may look at, as arrays by name."""
     train = [view for view in scene.split.train if not scene.pictures.cameras.is_line_camera(view)]
     arrays: dict[str, np.ndarray] = {}

@@ -131,13 +131,13 @@ def spectral_start(
     if from_run is None:
         first = initialise_endmembers(reflectance, count, method, generator)
         purity = normalize(reflectance, dim=1) @ normalize(first, dim=1).T
-        endmembers = _as_bright(first, reflectance, purity)
+        endmembers = as_bright_as_seen(first, reflectance, purity)
         abundances = fcls(reflectance, endmembers)
     else:
-        run = _RunMaterials(from_run, opened_run(from_run))
+        run = RunMaterials(from_run, opened_run(from_run))
         first = run.reflectances(bands, arrays["lamp"], count).to(reflectance)
         abundances = run.abundances(points.positions, points.geometric_normals, arrays["world_corners"])
-        endmembers = _as_bright(first, reflectance, abundances)
+        endmembers = as_bright_as_seen(first, reflectance, abundances)
     return SpectralStart(endmembers, points.positions, abundances)
 
 
@@ -172,7 +172,7 @@ def _plain_light(traced: TracedObject, points: SurfacePoints, base: float) -> Fl
     return plain.light(points, _SAMPLES, 0, torch.Generator(device).manual_seed(0))
 
 
-def _as_bright(
+def as_bright_as_seen(
     spectra: Float[Tensor, "K B"], pixels: Float[Tensor, "N B"], purity: Float[Tensor, "N K"]
 ) -> Float[Tensor, "K B"]:
     """Spectra of the same shape, each as bright as the purest of its pixels: in known light a pixel is as bright as its
@@ -210,7 +210,7 @@ def opened_run(path: Path) -> TrainedScene:
 
 
 @dataclass(frozen=True)
-class _RunMaterials:
+class RunMaterials:
     """What a run of unmix-nerf says of materials."""
 
     path: Path

@@ -92,7 +92,7 @@ def _features(stack: LayerStack) -> Tensor:
     return 2.0 * torch.cat([torch.stack(scalars), sheen, metal, torch.sqrt(metal + 1e-4)]).T - 1.0
 
 
-def _read_weights(path: Path = SHIPPED) -> tuple[Decoder, Encoder]:
+def read_weights(path: Path = SHIPPED) -> tuple[Decoder, Encoder]:
     """Decoder and encoder, frozen. Raises ConfigError: they can't be read, or have other names or shapes."""
     decoder, encoder = Decoder(), Encoder()
     both = nn.ModuleDict({"decoder": decoder, "encoder": encoder}).requires_grad_(False)
@@ -106,7 +106,7 @@ def _read_weights(path: Path = SHIPPED) -> tuple[Decoder, Encoder]:
     return decoder, encoder
 
 
-_shipped_weights = lru_cache(maxsize=1)(_read_weights)
+_shipped_weights = lru_cache(maxsize=1)(read_weights)
 
 
 class _DecodedFamily(StackFamily):
