@@ -31,7 +31,8 @@ from unmix_plugin import Cameras, Light, MaterialView, Recipe, TrainedScene, edi
 from unmix_plugin.commands.export import export
 from unmix_plugin.editing import Operation, Remove, Rename, Replace, Retint
 from unmix_plugin.engine.geometry.camera_paths import orbit
-from unmix_plugin.figures.pictures import ColourScale, paint
+from unmix_plugin.engine.registry import Output
+from unmix_plugin.figures.paint import paint
 from unmix_plugin.scenes.demo.scene import make_demo_scene
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb
 from unmix_plugin.trained.run_materials import endmember_colours
@@ -44,7 +45,7 @@ SETTINGS = {
     "turntable": {"endmembers": 6, "light": "camera"},
     "demo": {"endmembers": 6},
 }
-NDVI = ColourScale("RdYlGn", -0.1, 0.9, "NDVI")
+NDVI = Output("index:ndvi", "map", "NDVI", "NDVI", (-0.1, 0.9), "RdYlGn")
 INK, SOFT = "#1f2328", "#656d76"
 
 
@@ -131,10 +132,9 @@ def share(view: MaterialView, number: int) -> np.ndarray:
     return on_white(plt.get_cmap("viridis")(view["abundances"].cpu().numpy()[..., number])[..., :3], view)
 
 
-def index(view: MaterialView, name: str, scale: ColourScale) -> np.ndarray:
+def index(view: MaterialView, output: Output) -> np.ndarray:
     """An index on white."""
-    values = view[f"index:{name}"].cpu().numpy()
-    return on_white(paint(np.nan_to_num(values), scale), view)
+    return paint(output, view[output.name], view.opacity).picture(1.0)
 
 
 def on_white(picture: np.ndarray, view: MaterialView) -> np.ndarray:
@@ -299,7 +299,7 @@ def make_plant(studio: Studio) -> None:
     row = [
         ("true colour", colour(view)),
         ("infrared shown as red", infrared(view)),
-        ("NDVI: blue plastic fools it", index(view, "ndvi", NDVI)),
+        ("NDVI: blue plastic fools it", index(view, NDVI)),
         ("materials: told apart", materials(view, colours)),
     ]
     panels(PICTURES / "plant.png", [row], list(zip(scene.materials.names, colours, strict=True)))

@@ -10,7 +10,8 @@ from matplotlib.figure import Figure
 
 from unmix_plugin.engine.printing import plot_text
 from unmix_plugin.figures import plotting
-from unmix_plugin.figures.pictures import ColourScale, TitledPicture, draw_panels
+from unmix_plugin.figures.paint import ColourScale
+from unmix_plugin.figures.pictures import TitledPicture, draw_panels
 from unmix_plugin.products.endmembers import draw_spectra
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import srgb_to_linear

@@ -9,17 +9,9 @@ import torch
 from PIL import Image
 from torch.testing import assert_close
 
-from unmix_plugin.figures.pictures import (
-    NEUTRAL,
-    ColourScale,
-    TitledPicture,
-    draw_panels,
-    id_palette,
-    in_rows,
-    over_neutral,
-    paint,
-    premultiplied_over_neutral,
-)
+from unmix_plugin.figures.look import NEUTRAL
+from unmix_plugin.figures.paint import ColourScale
+from unmix_plugin.figures.pictures import TitledPicture, draw_panels, in_rows
 from unmix_plugin.products import evaluation as evaluation_module
 from unmix_plugin.products.endmembers import _write_endmembers
 from unmix_plugin.products.evaluation import (
@@ -83,21 +75,6 @@ def test_pictures_of_any_shape_fit_their_page(height, width):
     panels = [TitledPicture(np.zeros((height, width, 3)), "a title that is rather long", (0.5, 0.5, 0.5))] * 3
     legend = [("a material with a long name indeed", (1.0, 0.0, 0.0))] * 7
     assert_has_white_margins(draw_panels(in_rows(panels, 2), "heading", SCALE, legend))
-
-
-def test_where_nothing_is_pictures_are_neutral():
-    nothing, all_there = np.zeros((2, 2)), np.ones((2, 2))
-    black, white = np.zeros((2, 2, 3)), np.ones((2, 2, 3))
-    np.testing.assert_allclose(over_neutral(black, nothing), NEUTRAL)
-    np.testing.assert_allclose(over_neutral(black, all_there), 0.0)
-    np.testing.assert_allclose(premultiplied_over_neutral(black, nothing), NEUTRAL, atol=1e-6)
-    np.testing.assert_allclose(premultiplied_over_neutral(white, all_there), 1.0, atol=1e-6)
-    np.testing.assert_allclose(premultiplied_over_neutral(black, all_there), 0.0, atol=1e-6)
-    palette = id_palette({0: (1.0, 0.0, 0.0), 1: (0.0, 0.0, 1.0)})
-    np.testing.assert_array_equal(palette[[0, 1, 255]], [[1, 0, 0], [0, 0, 1], [NEUTRAL] * 3])
-    [painted] = paint(np.array([[-1.0, 0.0, 1.0, 7.0]]), SCALE)  # beyond a scale are the colours of its ends
-    np.testing.assert_array_equal(painted[[0, 3]], painted[[1, 2]])
-    assert np.abs(painted[1] - painted[2]).max() > 0.5
 
 
 def test_a_sky_is_seen_rather_than_what_pictures_lie_on():

@@ -52,7 +52,7 @@ def test_an_output_has_the_shape_and_the_values_that_it_promises(view, name):
     assert known.max() <= high + 1e-6
     if output.kind in ("map", "shares") and output.value_range is None:  # it gets one from the views
         assert needs_survey([output])
-        assert name in take_survey(SCENE, SCENE.views, [output]).scales
+        assert name in take_survey(SCENE, SCENE.views, [output]).ranges
 
 
 @pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
@@ -70,7 +70,9 @@ def test_the_range_of_colours_follows_the_unit_of_lengths(unit):
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("abundance", "no output named 'abundance' .did you mean abundances .*; known are rgb, "),
+        ("abundence", "no output named 'abundence' .did you mean abundance"),
+        ("abundance", "the output abundance needs a name or a number from 0, as in abundance:0"),
+        ("abundance:9", "abundance:9: there is no endmember '9'; known are endmember_0, endmember_1"),
         ("bands:650", r"no output named 'bands:650' \(did you mean band "),
         ("band", "the output band needs a wavelength, as in band:650nm"),
         ("index:", "the output index needs to know which, as in index:ndvi"),

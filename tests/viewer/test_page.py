@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.figures.pictures import ColourScale
+from unmix_plugin.figures.paint import ColourScale
 from unmix_plugin.formats.files import write_file
 from unmix_plugin.viewer import page
 from unmix_plugin.viewer.page import Debounced, choice, new_file, number, text

@@ -61,15 +61,7 @@ def test_small_pictures_and_labels_are_sent_without_loss_and_large_ones_compress
     labels = show_layer(page, "segmentation").reshape(-1, 3).astype(int)
     assert page.last_picture.startswith(b"\x89PNG")
     materials = viewer.services.maker.edited(Edit()).materials
-    colours = (
-        (
-            viewer.services.maker.aids.for_layers(viewer.services.maker.edited(Edit())).colours_of(materials)
-            * 255
-        )
-        .round()
-        .int()
-        .tolist()
-    )
+    colours = np.round(255 * endmember_colours(materials)).astype(int).tolist()
     background = [round(255 * BACKGROUNDS["grey"])] * 3
     assert {*map(tuple, labels.tolist())} <= {*map(tuple, [*colours, background])}
 

@@ -8,6 +8,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from torch import Tensor
+
 from tests.method_factory import BOX, make_model
 from tests.scenes.scene_factory import ring_poses
 from tests.trained.camera_scenes import cameras_at
@@ -16,13 +18,15 @@ from unmix_plugin.engine.runs.load_run import SceneRecord
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.engine.training.training_control import DeviceLock, TrainingControl
 from unmix_plugin.errors import SceneError
+from unmix_plugin.figures.paint import Legend, background_of
 from unmix_plugin.model import UnmixModel
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.trained.open_run import unmix_scene
 from unmix_plugin.trained.outputs import MaterialView
-from unmix_plugin.trained.trained_scene import TrainedScene
-from unmix_plugin.viewer.rendering.aids import LayerAids, render_reference
-from unmix_plugin.viewer.rendering.painting import LAYERS, Legend, _Picture, layer_named
+from unmix_plugin.trained.trained_scene import TrainedScene, reference_rays
+from unmix_plugin.viewer.rendering import painting
+from unmix_plugin.viewer.rendering.aids import LayerAids
+from unmix_plugin.viewer.rendering.painting import LAYERS, layer_named
 from unmix_plugin.viewer.rendering.pictures import Picture, PictureMaker, _Speedometer
 from unmix_plugin.viewer.rendering.render_loop import RenderLoop, View
 from unmix_plugin.viewer.rendering.scene import SceneSource
@@ -66,12 +70,13 @@ def make_aids(source: SceneSource) -> LayerAids:
     """What layers need."""
     with source.locked() as scene:
         assert isinstance(scene, TrainedScene)
-        return LayerAids(*render_reference(scene, source.record.train_cameras), source.record.scene_box)
+        return LayerAids(*reference_rays(scene, source.record.train_cameras), source.record.scene_box)
 
 
-def paint_layer(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -> tuple[_Picture, Legend]:
-    """The picture of the layer that the settings name, and its legend."""
-    return layer_named(settings.layer, LAYERS).paint(frame, settings, aids)
+def paint_layer(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -> tuple[Tensor, Legend]:
+    """The picture of the layer that the settings name, (H, W, 3) sRGB over its background, and its legend."""
+    painted = painting.paint_layer(layer_named(settings.layer, LAYERS), frame, settings, aids)
+    return painted.over(background_of(settings))[:, :, 0].float(), painted.legend
 
 
 def some_pose(index: int = 0) -> ViewPose:

@@ -17,9 +17,10 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from unmix_plugin.engine.processes import Processes
+    from unmix_plugin.figures.look import Look
     from unmix_plugin.products.render.cameras import RenderCameras
     from unmix_plugin.products.render.files import FormattedOutput
-    from unmix_plugin.products.render.pictures import Palette
+    from unmix_plugin.products.render.job import Survey
     from unmix_plugin.trained.open_run import LoadedRun
 
 
@@ -27,6 +28,7 @@ def render(argv: list[str]) -> None:
     """Parse the arguments, render each view, list the files."""
     options = tyro.cli(RenderOptions, prog="unmix-render", args=argv)
     options.asked_size()  # refused before processes start and the run is read
+    options.asked_look()
 
     from unmix_plugin.engine.processes import joined, start_together
 
@@ -99,6 +101,7 @@ def _render(
 ) -> None:
     """Render block by block, then list what was written."""
     from unmix_plugin.commands.reporting import follow, say, working
+    from unmix_plugin.figures.paint import legend_of
     from unmix_plugin.formats.files import refuse_to_overwrite, safe_name, write_file
     from unmix_plugin.products.render.files import file_name, needs_legend
     from unmix_plugin.products.render.job import RenderJob, Survey, needs_survey, output_paths, take_survey
@@ -112,7 +115,11 @@ def _render(
         for one in outputs
         if needs_legend(one, scene)
     }
-    tables = {folder / f"{file_name(output)}_legend.csv": output for output in asked if output.classes}
+    tables = {
+        folder / f"{file_name(output)}_legend.csv": output
+        for output in asked
+        if output.classes and output.kind == "labels"
+    }
     camera_files: dict[Path, bytes] = {}
     if cameras.map_info is None:  # which no camera file can hold
         frames_per_second = (cameras.frames_per_second or 24.0) if cameras.is_path else None
@@ -135,18 +142,20 @@ def _render(
     )
     survey = Survey()
     with processes.together():
-        if needs_survey(asked):
+        if needs_survey(asked, options.asked_look()):
             with working(console, "looking at all views for what their pictures share"):
-                survey = take_survey(scene, cameras.views, asked, cameras.map_info)
-    job = RenderJob(scene, cameras, outputs, survey, folder, processes)
+                survey = take_survey(scene, cameras.views, asked, cameras.map_info, options.asked_look())
+    job = RenderJob(scene, cameras, outputs, survey, folder, processes, options.asked_look())
     job.render(follow(console, "rendering", job.blocks()))
     if not processes.is_first:
         return
     for path, output in legends.items():
-        write_file(path, draw_legend(output, job.palette))
+        write_file(
+            path, draw_legend(output, legend_of(output, survey.ranges.get(output.name), options.asked_look()))
+        )
     for path, output in tables.items():
         write_file(path, legend_csv(output.classes))
-    _list(folder, outputs, cameras, job.palette)
+    _list(folder, outputs, cameras, survey, options.asked_look())
     for path in (*legends, *tables):
         tell(f"{path}  what the colours mean")
     for path in camera_files:
@@ -154,15 +163,23 @@ def _render(
 
 
 def _list(
-    folder: Path, outputs: tuple[FormattedOutput, ...], cameras: RenderCameras, palette: Palette
+    folder: Path,
+    outputs: tuple[FormattedOutput, ...],
+    cameras: RenderCameras,
+    survey: Survey,
+    look: Look,
 ) -> None:
     """A line for each output and format: where, how many, what."""
+    from unmix_plugin.figures.paint import describe
     from unmix_plugin.products.render.job import is_video_of_all, output_paths
 
     for one in outputs:
         paths = output_paths(folder, one, cameras)
         is_picture = one.format in ("png", "mp4")
-        what = palette.describe(one.output, one.format == "mp4") if is_picture else one.output.what
+        what = one.output.what
+        if is_picture and one.output.kind != "channels":
+            given = survey.ranges.get(one.output.name)
+            what = describe(one.output, given, look, is_opaque=one.format == "mp4")
         if is_video_of_all(one, cameras):
             tell(f"{paths[0]}  {counted(len(cameras.views), 'frame')}; {what}")
         elif len(paths) == 1:

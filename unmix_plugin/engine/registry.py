@@ -155,7 +155,8 @@ class Output:
     colour_map: str = "viridis"
     """As matplotlib names it."""
     classes: tuple[tuple[str, tuple[float, ...]], ...] = ()
-    """Of labels: names of the ids from 0 and their sRGB colours, where they are not those of the scene's materials."""
+    """Of labels and shares: names of the ids from 0, or of the channels, and their sRGB colours; empty where they have
+    none of their own."""
     unit: str = field(default="", kw_only=True)
     """Of its numbers; `WORLD_UNITS` of lengths, which maps with a scale have in metres."""
     quantity: Literal["radiance", "reflectance"] | None = field(default=None, kw_only=True)
@@ -164,6 +165,10 @@ class Output:
     """Centre of the band that each channel is; empty where channels are not single bands, or those of the scene."""
     is_on_black: bool = field(default=False, kw_only=True)
     """Whether it is light seen before black, which pictures say otherwise."""
+    is_premultiplied: bool = field(default=False, kw_only=True)
+    """Whether its numbers are multiplied by the opacity, as light is anyway: pictures show them as of what is seen."""
+    legend: str = field(default="", kw_only=True)
+    """What the colours of pictures mean, for people; empty: what the numbers are."""
     nothing: int | None = field(default=None, kw_only=True)
     """The number of pixels in which nothing is, where only that tells them; means of other programs leave it out."""
     remarks: tuple[str, ...] = field(default=(), kw_only=True)

@@ -11,16 +11,17 @@ Notation: pictures are (H, W, 3) sRGB in [0, 1]; `h x W` pixels, some rows of th
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float64, UInt8
+from jaxtyping import Float, UInt8
 
 from unmix_plugin.engine.printing import plot_text
+from unmix_plugin.figures.paint import ColourScale
 from unmix_plugin.figures.plotting import (
     FIGURE_DPI,
     Colour,
@@ -30,10 +31,6 @@ from unmix_plugin.figures.plotting import (
     page_in_inches,
 )
 from unmix_plugin.formats.files import rgba_png_bytes
-from unmix_plugin.spectral.colour.srgb import decode_srgb, encode_srgb
-
-NEUTRAL = 0.92
-"""sRGB grey of what shows nothing."""
 
 _FONT_PT = 10
 _MARGIN, _GAP, _TITLE, _HEADING, _LEGEND_ROW = 0.15, 0.14, 0.30, 0.34, 0.25
@@ -54,49 +51,6 @@ class TitledPicture:
     title: str
     swatch: Colour | None = None
     """sRGB colour of a small square before the title."""
-
-
-@dataclass(frozen=True)
-class ColourScale:
-    """How values become colours."""
-
-    colour_map: str
-    """A name of matplotlib's."""
-    low: float
-    high: float
-    """Values at the two ends; those outside get the colours of the ends."""
-    label: str
-    """What the values are, with their unit."""
-
-
-def paint(values: Float[np.ndarray, "H W"], scale: ColourScale) -> Picture:
-    """Values as colours of a scale; undefined ones are the neutral grey."""
-    from matplotlib import colormaps
-
-    fraction = (values - scale.low) / (scale.high - scale.low)
-    colours = colormaps[scale.colour_map](np.clip(fraction, 0, 1))[..., :3]
-    return np.where(np.isnan(values)[..., None], NEUTRAL, colours)
-
-
-def over_neutral(picture: Picture, opacity: Float[np.ndarray, "H W"]) -> Picture:
-    """A picture that is not multiplied by its opacity, laid over the neutral grey."""
-    part = np.clip(opacity, 0, 1)[..., None]
-    return picture * part + NEUTRAL * (1 - part)
-
-
-def premultiplied_over_neutral(linear_rgb: Picture, opacity: Float[np.ndarray, "H W"]) -> Picture:
-    """Linear light seen on black, laid over the neutral grey and encoded as sRGB."""
-    behind = decode_srgb(np.array(NEUTRAL))
-    light = linear_rgb + behind * (1 - np.clip(opacity, 0, 1)[..., None])
-    return encode_srgb(np.clip(light.astype(np.float64), 0, 1))
-
-
-def id_palette(colours: Mapping[int, Colour]) -> Float64[np.ndarray, "256 3"]:
-    """sRGB of each id, neutral grey for those without a colour."""
-    palette = np.full((256, 3), NEUTRAL)
-    for index, colour in colours.items():
-        palette[index] = colour
-    return palette
 
 
 def columns_for(count: int) -> int:

@@ -24,20 +24,13 @@ from torch import Tensor
 
 from unmix_plugin.engine.pipeline import Pipeline, average_metrics
 from unmix_plugin.engine.processes import Processes
-from unmix_plugin.figures.pictures import (
-    NEUTRAL,
-    ColourScale,
-    Picture,
-    TitledPicture,
-    draw_panels,
-    id_palette,
-    in_rows,
-    over_neutral,
-    paint,
-)
+from unmix_plugin.engine.registry import Output
+from unmix_plugin.figures.look import NEUTRAL
+from unmix_plugin.figures.paint import paint, scale_of
+from unmix_plugin.figures.pictures import Picture, TitledPicture, draw_panels, in_rows
 from unmix_plugin.figures.plotting import RIGHT, WRONG, Colour, distinct_colours, own_colours
 from unmix_plugin.formats.files import rgba_png_bytes, write_file
-from unmix_plugin.products.views import SHARE_SCALE, share_panels
+from unmix_plugin.products.views import SHARE_SCALE, paint_ids, share_panels
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import describe_colour
@@ -59,7 +52,7 @@ from unmix_plugin.trained.evaluation import (
 from unmix_plugin.trained.run_views import views_of
 from unmix_plugin.trained.trained_scene import TrainedScene
 
-_ERROR_SCALE = ColourScale("magma", 0.0, 0.2, "error of sRGB")
+_ERROR = Output("error", "map", "error", "error of sRGB", (0.0, 0.2), "magma")
 _COLUMNS = 7
 _Follow = Callable[[str, Sequence[Any]], Iterator[Any]]
 """The items given, while it is shown how many are done."""
@@ -186,9 +179,10 @@ class MaterialLook:
 
     def predicted(self, ids: UInt8[np.ndarray, "H W"], matching: Mapping[int, int]) -> Picture:
         """Predicted ids in the colours of the true materials that they are matched to, or in their own."""
-        matched = {pred: self.true_colours[true] for pred, true in matching.items()}
-        own = {index: colour for index, (_, colour) in self.surplus(matching).items()}
-        return id_palette({**matched, **own})[ids]
+        colours = np.array(self.surplus_colours)
+        for pred, true in matching.items():
+            colours[pred] = self.true_colours[true]
+        return paint_ids(ids, self.pred_names, colours)
 
     def beside_labels(
         self, ids: UInt8[np.ndarray, "H W"], labels: UInt8[np.ndarray, "H W"], matching: Mapping[int, int]
@@ -196,7 +190,7 @@ class MaterialLook:
         """True labels, predicted materials in their colours, and where they differ."""
         agreement = np.where((as_true(ids, matching) != labels)[..., None], WRONG, RIGHT)
         agreement[labels == NOTHING_ID] = NEUTRAL
-        true = id_palette(dict(enumerate(self.true_colours)))[labels]
+        true = paint_ids(labels, self.true_names, self.true_colours)
         return true, self.predicted(ids, matching), agreement
 
 
@@ -230,11 +224,11 @@ def _draw_colour(view: ViewTruth, predicted: PredictedView, bands: Bands, psnr_d
     panels = [
         TitledPicture(coloured_picture(view.spectra, view.opacity, weights), "true"),
         TitledPicture(coloured_picture(spectra, predicted.coverage, weights), "predicted"),
-        TitledPicture(over_neutral(paint(error, _ERROR_SCALE), counted), "error"),
+        TitledPicture(paint(_ERROR, error, counted).picture(), "error"),
     ]
     colours = describe_colour(bands).split(":")[0] if view.sensor is None else f"seen by {view.sensor.name}"
     heading = f"{view.name}: {colours}, spectral PSNR {psnr_db:.1f} dB"
-    return draw_panels([panels], heading, _ERROR_SCALE)
+    return draw_panels([panels], heading, scale_of(_ERROR))
 
 
 def _draw_matched_segmentation(

@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float, Float32, Float64
 
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.figures.pictures import id_palette
+from unmix_plugin.figures.paint import id_palette
 from unmix_plugin.formats.files import (
     eight_bits,
     indexed_png_bytes,
@@ -135,7 +135,7 @@ def _textures(scene: TrainedScene, mesh: TriangleMesh, size: int | None) -> _Tex
         shares.append(eight_bits(looks.abundances.numpy()))
     share_pictures = texels.texture(np.concatenate(shares))
     names = scene.materials.names
-    palette = id_palette(dict(enumerate(endmember_colours(scene.materials))))
+    palette = id_palette(endmember_colours(scene.materials))
     id_picture = texels.texture(np.concatenate(ids)[:, None])[..., 0]
     pictures = {
         "colour": rgba_png_bytes(texels.texture(np.concatenate(colours)), "diffuse colour, sRGB"),
@@ -225,7 +225,7 @@ def _write_obj(
     names, palette = looks.materials.names, looks.palette
     if (materials == NOTHING_ID).any():
         materials, names = materials.clip(max=len(names)), (*names, "nothing")
-        palette = np.concatenate([palette, id_palette({})[:1]])
+        palette = np.concatenate([palette, id_palette(())[:1]])
     named = (names, palette, comments)
     written = write_obj(path.with_suffix(""), *vertices, mesh.faces, materials, *named, shown)
     return [*written, *pictures]

@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.products.render.files import COVERAGE, Rows, choose_formats, still
+from unmix_plugin.products.render.files import Rows, choose_formats, is_painted, still
 from unmix_plugin.products.render.job import setting_for, take_survey
-from unmix_plugin.trained.outputs import MaterialView
+from unmix_plugin.trained.outputs import MaterialView, picture_values, values_of
 from unmix_plugin.trained.run_views import RunView
 
 _FORMATS = {".npy": "npy", ".png": "png", ".exr": "exr", ".hdr": "envi"}
@@ -41,11 +39,10 @@ def save(view: MaterialView, name: str, path: str | Path, *, label: str = "") ->
     outputs = [formatted.output]
     survey = take_survey(scene, [RunView(path.stem, camera)], outputs if path.suffix == ".png" else [])
     setting = replace(setting_for(scene, camera, outputs, survey, path.parent), label=label)
-    values: dict[str, np.ndarray] = {
-        "accumulation": view.opacity.cpu().numpy(),
-        COVERAGE: view.coverage.cpu().numpy(),
-        name: view[name].cpu().numpy(),
-    }
+    own = survey.outputs.get(name, formatted.output)
+    values = {} if is_painted(formatted) else {name: values_of(view, own).cpu().numpy()}
+    painted = {name: picture_values(view, own)} if is_painted(formatted) else {}
+    opacity, coverage = (part.cpu().numpy() for part in (view.opacity, view.coverage))
     with still(path, formatted, setting) as add:
-        add(Rows(0, values))
+        add(Rows(0, values, painted, opacity, coverage))
     return path

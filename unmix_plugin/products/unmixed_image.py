@@ -12,7 +12,9 @@ import numpy as np
 import torch
 from jaxtyping import Float64, Int
 
-from unmix_plugin.figures.pictures import ColourScale, TitledPicture, draw_panels, in_rows, paint
+from unmix_plugin.engine.registry import Output
+from unmix_plugin.figures.paint import paint, scale_of
+from unmix_plugin.figures.pictures import Picture, TitledPicture, draw_panels, in_rows
 from unmix_plugin.figures.plotting import distinct_colours, own_colours
 from unmix_plugin.formats.envi import envi_cube_paths, write_envi_cube
 from unmix_plugin.formats.files import csv_bytes, make_folder, write_file
@@ -93,13 +95,19 @@ def write_unmixed_image(
 
 def _maps(found: UnmixedImage, names: list[str], colours: np.ndarray) -> bytes:
     """A map of each material, the main materials in their colours, and confidence."""
-    scale = ColourScale("viridis", 0.0, 1.0, f"share of {found.shares}, or probability")
+    output = Output("share", "map", "share", f"share of {found.shares}, or probability", (0.0, 1.0))
+
+    def painted(values: np.ndarray) -> Picture:
+        return paint(output, values, np.ones(values.shape)).picture()
+
     panels = [
-        TitledPicture(paint(found.abundances[..., index], scale), name, colours[index])
+        TitledPicture(painted(found.abundances[..., index]), name, colours[index])
         for index, name in enumerate(names)
     ]
     shown = found.abundances.sum(axis=-1, keepdims=True) > 0
     main = np.where(shown, colours[found.abundances.argmax(axis=-1)], 0.9)
     panels.append(TitledPicture(main, "main material"))
-    panels.append(TitledPicture(paint(found.confidence, scale), "confidence"))
-    return draw_panels(in_rows(panels), "Abundances", scale, list(zip(names, colours, strict=True)))
+    panels.append(TitledPicture(painted(found.confidence), "confidence"))
+    return draw_panels(
+        in_rows(panels), "Abundances", scale_of(output), list(zip(names, colours, strict=True))
+    )

@@ -10,19 +10,13 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from unmix_plugin.figures.pictures import (
-    NEUTRAL,
-    ColourScale,
-    TitledPicture,
-    draw_panels,
-    id_palette,
-    in_rows,
-    over_neutral,
-    paint,
-)
+from unmix_plugin.engine.registry import Output
+from unmix_plugin.figures.look import NEUTRAL
+from unmix_plugin.figures.paint import paint, scale_of
+from unmix_plugin.figures.pictures import Picture, TitledPicture, draw_panels, in_rows
 from unmix_plugin.formats.envi import envi_cube_paths
 from unmix_plugin.formats.files import array_bytes, write_file
 from unmix_plugin.products.product import Job
@@ -33,12 +27,13 @@ from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import colour_mode
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.spectral.segmentation import NOTHING_ID
-from unmix_plugin.trained.evaluation import PredictedView, as_numpy, picture, predicted_view
+from unmix_plugin.trained.evaluation import PredictedView, picture, predicted_view
 from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.trained.run_materials import endmember_colours
 
-SHARE_SCALE = ColourScale("viridis", 0.0, 1.0, "abundance")
-"""Colours of abundances, the same in every figure."""
+SHARE = Output("abundance", "map", "abundance", "abundance", (0.0, 1.0))
+"""A material's part of what is seen, in the same colours in every figure."""
+SHARE_SCALE = scale_of(SHARE)
 
 
 def abundances(job: Job, asked: Abundances) -> list[Path]:
@@ -124,17 +119,26 @@ def share_panels(
     swatches: Float[np.ndarray, "K 3"],
 ) -> list[TitledPicture]:
     """A panel for each material: its share of what is seen, faded by opacity."""
-    images = [paint(image, SHARE_SCALE) for image in np.moveaxis(as_numpy(shares), -1, 0)]
+    images = shares.unbind(dim=-1)
     return [
-        TitledPicture(over_neutral(image, as_numpy(opacity)), title, swatch)
+        TitledPicture(paint(SHARE, image, opacity).picture(), title, swatch)
         for image, title, swatch in zip(images, titles, swatches, strict=True)
     ]
+
+
+def paint_ids(
+    ids: UInt8[Tensor | np.ndarray, "H W"], names: Sequence[str], colours: Float[np.ndarray, "K 3"]
+) -> Picture:
+    """Each id in the colour of its class, grey where nothing is."""
+    classes = tuple(zip(names, map(tuple, colours.tolist()), strict=True))
+    output = Output("segmentation", "labels", "segmentation", "index of the material", classes=classes)
+    return paint(output, ids, np.ones(ids.shape)).picture()
 
 
 def draw_segmentation(name: str, view: PredictedView, materials: Materials) -> bytes:
     """A figure of a view in colour and of its materials, with a legend of those that occur."""
     colours, ids = endmember_colours(materials), view.segmentation.numpy()
-    painted = TitledPicture(id_palette(dict(enumerate(colours)))[ids], "materials")
+    painted = TitledPicture(paint_ids(view.segmentation, materials.names, colours), "materials")
     present = [index for index in range(len(colours)) if (ids == index).any()]
     legend = [(materials.names[index], colours[index]) for index in present]
     panels = [[colour_panel(view, materials.bands), painted]]

@@ -19,8 +19,10 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.registry import Output
 from unmix_plugin.errors import RunError
-from unmix_plugin.figures.pictures import Picture, premultiplied_over_neutral
+from unmix_plugin.figures.paint import paint
+from unmix_plugin.figures.pictures import Picture
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
@@ -113,7 +115,10 @@ def coloured_picture(
 ) -> Picture:
     """The same with other weights of the channels in red, green and blue."""
     linear = spectra.double().clamp(min=0) @ weights.double()
-    return premultiplied_over_neutral(linear.clamp(0, 1).numpy(), as_numpy(coverage))
+    return paint(_COLOUR, linear, coverage).picture()
+
+
+_COLOUR = Output("linear_rgb", "linear", "colour", "linear light in sRGB primaries")
 
 
 def as_numpy(values: Tensor) -> np.ndarray:

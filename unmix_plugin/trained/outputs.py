@@ -18,7 +18,7 @@ from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.registry import WORLD_UNITS, Output, OutputKind, no_output
-from unmix_plugin.errors import ConfigError, SpectrumError
+from unmix_plugin.errors import ConfigError, SpectrumError, did_you_mean
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import (
     band_composite_matrix,
@@ -28,10 +28,12 @@ from unmix_plugin.spectral.colour.conversion import (
     rgb_matrix,
 )
 from unmix_plugin.spectral.features import FEWEST_BANDS, continuum_removed, derivative_matrix
-from unmix_plugin.spectral.materials import Coefficients, Materials
+from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Coefficients, Materials
 from unmix_plugin.spectral.segmentation import NOTHING_ID, material_scores
 from unmix_plugin.spectral.subspace import PcaColours
-from unmix_plugin.trained.reflectance_maps import parse_reflectance_map
+from unmix_plugin.trained.protocol import RenderedView
+from unmix_plugin.trained.reflectance_maps import ReflectanceMap, Score, parse_reflectance_map
+from unmix_plugin.trained.run_materials import endmember_colours
 
 if TYPE_CHECKING:
     from unmix_plugin.trained.trained_scene import TrainedScene
@@ -104,6 +106,13 @@ Capability: TypeAlias = Literal["light"]
 """What a scene may lack that an output needs: a known light."""
 
 
+_Compute: TypeAlias = Callable[[MaterialView], Tensor]
+"""From a rendered view to (H, W, ...)."""
+
+_LEAST_SEEN = 1e-3
+"""Opacity under which nothing can be said of what is seen."""
+
+
 @dataclass(frozen=True)
 class MaterialOutput(Output):
     """An output of a scene of mixed materials, with its function."""
@@ -113,16 +122,100 @@ class MaterialOutput(Output):
     needs: frozenset[Capability] = field(default=frozenset(), kw_only=True)
     fewest_bands: int = field(default=1, kw_only=True)
     """With light, that it takes."""
+    light: Callable[[MaterialView], Tensor] | None = field(default=None, kw_only=True)
+    """Of outputs that are cut at white: the linear light before that, which pictures are painted from."""
+    score: ReflectanceMap | None = field(default=None, kw_only=True)
+    """Of outputs that are made of reflectance."""
+
+    def judged_against(self, background: Float[Tensor, "N B"]) -> MaterialOutput:
+        """The same where what is seen is judged against reflectances of all views, rather than of the view itself."""
+        if self.score is None:
+            return self
+        score = self.score.fit(background)
+        return replace(self, compute=lambda view: _scored(view, score))
+
+    def with_components(self, colours: PcaColours) -> MaterialOutput:
+        """The output `pca` with the components of all views, rather than of the view itself."""
+        return replace(self, compute=lambda view: _components(view, colours))
 
 
-def _linear_rgb(view: MaterialView) -> Tensor:
-    # Clamped after the colours are made: in another light a band may exceed the sensor's full scale.
-    return view.materials.through(view.coefficients, rgb_matrix(view.materials.bands)).clamp(0, 1)
+@dataclass(frozen=True)
+class PictureValues:
+    """What a picture of an output is painted from."""
+
+    output: Output
+    values: Tensor
+    """(H, W, ...)."""
+    opacity: Float[Tensor, "H W"]
+    """How much of each pixel they fill, [0, 1]: light also comes from a sky."""
+
+    @property
+    def seen(self) -> Tensor:
+        """The numbers of what is seen, where something is."""
+        is_there, values = self.opacity > OCCUPIED_ACCUMULATION, self.values
+        if self.output.is_premultiplied or self.output.kind == "grey":
+            parts = self.opacity.clamp(min=_LEAST_SEEN)
+            values = values / parts.view(*parts.shape, *(1,) * (values.dim() - parts.dim()))
+        return values[is_there]
+
+
+@torch.no_grad()
+def values_of(view: RenderedView, output: Output) -> Tensor:
+    """The numbers of an output of a view, (H, W, ...)."""
+    if isinstance(view, MaterialView) and isinstance(output, MaterialOutput):
+        return output.compute(view)
+    return view[output.name]
+
+
+_TRACE_OPACITY = 0.25
+"""Opacity under which a pixel counts as empty once materials are removed: these leave faint specks where they were
+mixed with others."""
+
+
+@torch.no_grad()
+def picture_values(view: RenderedView, output: Output) -> PictureValues:
+    """What a picture of an output is painted from: its numbers, or the light before it is cut at white."""
+    if not isinstance(view, MaterialView) or not isinstance(output, MaterialOutput):
+        return _filled(view, output, values_of(view, output))
+    if view.scene.has_removed:
+        is_there = (view.opacity >= _TRACE_OPACITY)[..., None]
+        view = view.map(lambda packed: packed * is_there)
+    if output.light is not None:
+        return _filled(view, replace(output, kind="linear"), output.light(view))
+    return _filled(view, output, output.compute(view))
+
+
+def _filled(view: RenderedView, output: Output, values: Tensor) -> PictureValues:
+    if output.name == "accumulation":  # opacity itself is shown everywhere, also where there is little of it
+        return PictureValues(output, values, torch.ones_like(view.opacity))
+    is_light = output.kind in ("srgb", "linear", "grey", "channels")
+    return PictureValues(output, values, view.coverage if is_light else view.opacity)
+
+
+def _light(matrix: Callable[[Bands], Tensor], *, diffuse: bool = True, specular: bool = True) -> _Compute:
+    """Linear light through three weights a band, not cut at white: in another light a band may exceed full scale."""
+    return lambda view: view.materials.through(
+        view.coefficients, matrix(view.materials.bands), diffuse=diffuse, specular=specular
+    )
+
+
+def _components(view: MaterialView, colours: PcaColours) -> Tensor:
+    """Principal components of what is seen, stretched to [0, 1]; 0 where nothing is."""
+    opacity = view.opacity[..., None]
+    seen = view.materials.through(view.coefficients, colours.axes) / opacity.clamp(min=_LEAST_SEEN)
+    components = seen - colours.mean @ colours.axes
+    stretched = (components - colours.low) / (colours.high - colours.low).clamp(min=1e-9)
+    return stretched.clamp(0, 1) * (opacity >= _LEAST_SEEN)
+
+
+def components_of(materials: Materials, seen: Coefficients) -> PcaColours:
+    """Principal components of the spectra of rays that end on something, as if each ended fully on it."""
+    return PcaColours.fit(materials.spectra(seen) / seen.accumulation[..., None])
 
 
 def _pca(view: MaterialView) -> Tensor:
-    spectra, seen = view.spectra, view.coefficients.is_occupied
-    return PcaColours.fit(spectra[seen])(spectra) * seen[..., None]
+    seen = view.coefficients.flatten()
+    return _components(view, components_of(view.materials, seen.map(lambda packed: packed[seen.is_occupied])))
 
 
 def _reflectance(view: MaterialView) -> Tensor:
@@ -163,6 +256,11 @@ _NOTHING_IS_NAN = "NaN where nothing is"
 def _table() -> tuple[MaterialOutput, ...]:
     """All outputs that take no argument, in the order in which they are offered; `{quantity}` is what spectra are."""
     row = MaterialOutput
+    colour, diffuse, specular = (
+        _light(rgb_matrix),
+        _light(rgb_matrix, specular=False),
+        _light(rgb_matrix, diffuse=False),
+    )
     needs_light: frozenset[Capability] = frozenset({"light"})
     return (
         row(
@@ -172,7 +270,8 @@ def _table() -> tuple[MaterialOutput, ...]:
             "sRGB",
             is_on_black=True,
             remarks=("0 to 1",),
-            compute=lambda view: linear_to_srgb(_linear_rgb(view)),
+            light=colour,
+            compute=lambda view: linear_to_srgb(colour(view).clamp(0, 1)),
         ),
         row(
             "linear_rgb",
@@ -181,7 +280,8 @@ def _table() -> tuple[MaterialOutput, ...]:
             "linear light in sRGB primaries",
             is_on_black=True,
             remarks=("0 to 1",),
-            compute=_linear_rgb,
+            light=colour,
+            compute=lambda view: colour(view).clamp(0, 1),
         ),
         row(
             "spectral",
@@ -201,12 +301,32 @@ def _table() -> tuple[MaterialOutput, ...]:
             compute=lambda view: view.materials.diffuse(view.coefficients),
         ),
         row(
+            "diffuse_rgb",
+            "srgb",
+            "diffuse part in colour",
+            "sRGB without the view-dependent part",
+            is_on_black=True,
+            remarks=("0 to 1",),
+            light=diffuse,
+            compute=lambda view: linear_to_srgb(diffuse(view).clamp(0, 1)),
+        ),
+        row(
             "specular",
             "channels",
             "specular part",
             "view-dependent part of the {quantity}",
             remarks=_FULL_SCALE,
             compute=lambda view: view.materials.specular(view.coefficients),
+        ),
+        row(
+            "specular_rgb",
+            "srgb",
+            "specular part in colour",
+            "sRGB of the view-dependent part",
+            is_on_black=True,
+            remarks=("0 to 1",),
+            light=specular,
+            compute=lambda view: linear_to_srgb(specular(view).clamp(0, 1)),
         ),
         row(
             "reflectance",
@@ -251,6 +371,7 @@ def _table() -> tuple[MaterialOutput, ...]:
             "all abundances",
             "abundances",
             _UNIT,
+            is_premultiplied=True,
             remarks=("summing to the opacity",),
             compute=lambda view: view.coefficients.abundances,
         ),
@@ -293,6 +414,7 @@ def _table() -> tuple[MaterialOutput, ...]:
             "picture",
             "principal components",
             "three principal components of the spectra",
+            legend="red, green, blue: first, second, third principal component of the spectra",
             remarks=("each stretched from its 1st to its 99th percentile",),
             compute=_pca,
         ),
@@ -386,7 +508,8 @@ def _false_colour(name: str, argument: str, materials: Materials) -> MaterialOut
         raise ConfigError(
             f"false-colour takes three wavelengths, as in {FAMILIES['false-colour'].example}; got {name}"
         )
-    matrix = band_composite_matrix(materials.bands, wavelengths)
+    light = _light(lambda bands: band_composite_matrix(bands, wavelengths))
+    band_composite_matrix(materials.bands, wavelengths)  # which refuses wavelengths without a band
     centers, shown = _shown_nm(materials.bands, wavelengths)
     return MaterialOutput(
         name,
@@ -396,8 +519,10 @@ def _false_colour(name: str, argument: str, materials: Materials) -> MaterialOut
         quantity=materials.quantity,
         centers_nm=centers,
         is_on_black=True,
+        legend="red {:.0f} nm, green {:.0f} nm, blue {:.0f} nm".format(*centers),
         remarks=(f"the bands: {shown}",),
-        compute=lambda view: view.materials.through(view.coefficients, matrix).clamp(0, 1),
+        light=light,
+        compute=lambda view: light(view).clamp(0, 1),
     )
 
 
@@ -411,6 +536,8 @@ def _reflectance_map(name: str, _: str, materials: Materials) -> MaterialOutput:
     undefined = ("NaN where undefined",) if asked.kind == "map" else ()
 
     def compute(view: MaterialView) -> Tensor:
+        if asked.is_local:
+            return _scored(view, asked.fit(torch.empty(0, len(view.materials.bands))))
         reflectance = view.materials.reflectance(view.coefficients)
         return asked.fit(reflectance[view.coefficients.is_occupied])(reflectance)
 
@@ -423,7 +550,38 @@ def _reflectance_map(name: str, _: str, materials: Materials) -> MaterialOutput:
         classes=asked.classes,
         nothing=NOTHING_ID if asked.kind == "labels" else None,
         remarks=(*asked.remarks, *_caveat(materials), *undefined),
+        score=asked,
         compute=compute,
+    )
+
+
+_CHUNK = 1 << 16
+"""Pixels whose spectra are held at once."""
+
+
+def _scored(view: MaterialView, score: Score) -> Tensor:
+    """Numbers made of reflectance, chunk by chunk: the spectra of a whole picture may not fit into memory."""
+    rows = view.coefficients.flatten()
+    chunks = [rows.map(lambda _, part=part: part) for part in rows.packed.split(_CHUNK)]
+    return torch.cat([score(view.materials.reflectance(chunk)) for chunk in chunks]).view(view.opacity.shape)
+
+
+def _abundance(name: str, argument: str, materials: Materials) -> MaterialOutput:
+    number = int(argument) if argument.isdecimal() and argument not in materials.names else -1
+    if argument not in materials.names and not 0 <= number < len(materials.names):
+        hint = did_you_mean(argument, materials.names, likeness=0.5, form=" ({})")
+        raise ConfigError(
+            f"{name}: there is no endmember {argument!r}{hint}; known are {', '.join(materials.names)}"
+        )
+    index = materials.names.index(argument) if argument in materials.names else number
+    return MaterialOutput(
+        name,
+        "map",
+        FAMILIES["abundance"].title,
+        f"abundance of {materials.names[index]}",
+        _UNIT,
+        is_premultiplied=True,
+        compute=lambda view: view.coefficients.abundances[..., index],
     )
 
 
@@ -443,6 +601,9 @@ FAMILIES: dict[str, _Family] = {
     "band": _Family("grey", "one band", "a wavelength", "band:650nm", _band),
     "false-colour": _Family(
         "linear", "false colour", "wavelengths", "false-colour:860,650,550", _false_colour
+    ),
+    "abundance": _Family(
+        "map", "abundance of one endmember", "a name or a number from 0", "abundance:0", _abundance
     ),
     "index": _Family("map", "spectral index", "to know which", "index:ndvi", _reflectance_map),
     "target": _Family("map", "likeness to a target", "to know which", "target:paint.csv", _reflectance_map),
@@ -506,10 +667,17 @@ def _fitted(output: MaterialOutput, materials: Materials) -> MaterialOutput:
     if len(lit_nm) < output.fewest_bands:
         derivative_matrix(lit_nm)  # which refuses fewer
     more: tuple[str, ...] = ()
+    legend, classes = output.legend, output.classes
+    if output.kind in ("srgb", "linear"):
+        legend = describe_colour(materials.bands)
+    if output.kind in ("labels", "shares"):
+        colours = map(tuple, endmember_colours(materials).tolist())
+        classes = tuple(zip(materials.names, colours, strict=True))
     if output.kind in ("srgb", "linear") and colour_mode(materials.bands) == "false-colour":
         more = (describe_colour(materials.bands),)
     elif output.kind == "spectra":
         more = _caveat(materials)
     quantity = materials.quantity if output.kind == "channels" else None
     label = output.label.replace("{quantity}", materials.quantity)
-    return replace(output, label=label, quantity=quantity, remarks=(*output.remarks, *more))
+    remarks = (*output.remarks, *more)
+    return replace(output, label=label, quantity=quantity, remarks=remarks, legend=legend, classes=classes)

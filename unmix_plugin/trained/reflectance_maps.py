@@ -51,6 +51,9 @@ class ReflectanceMap:
     remarks: tuple[str, ...] = ()
     """What else is to be known of them, for people."""
 
+    is_local: bool = True
+    """Whether a pixel's number follows from its own spectrum alone, whatever it might be judged against."""
+
     @property
     def what(self) -> str:
         """What its numbers are, in one line for people."""
@@ -103,7 +106,7 @@ def _target(argument: str, bands: Bands, lit: Bool[np.ndarray, " B"]) -> Reflect
         score = target.fit(background[:, chosen])
         return lambda spectra: score(spectra[..., chosen])
 
-    return ReflectanceMap(target.what, target.usual_range, fit, remarks=_left_out(lit))
+    return ReflectanceMap(target.what, target.usual_range, fit, remarks=_left_out(lit), is_local=False)
 
 
 _LIBRARY = re.compile(r"(?P<angle>angle:)?(?P<file>.+?)\s*(<\s*(?P<limit>\d+\.?\d*|\.\d+)\s*)?", re.DOTALL)

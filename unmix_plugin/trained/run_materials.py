@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -27,7 +28,14 @@ from unmix_plugin.spectral.materials import Materials
 
 def endmember_colours(materials: Materials) -> Float64[np.ndarray, "K 3"]:
     """sRGB colours that stand for the endmembers in all pictures of a run: near their own, and told apart."""
-    return distinct_colours(own_colours(materials.endmembers, materials.bands))
+    own = own_colours(materials.endmembers, materials.bands)
+    return np.frombuffer(_distinct(own.tobytes())).reshape(own.shape).copy()
+
+
+@lru_cache(maxsize=64)
+def _distinct(own: bytes) -> bytes:
+    """Colours told apart: what the viewer asks at each picture takes a while to find."""
+    return distinct_colours(np.frombuffer(own).reshape(-1, 3)).tobytes()
 
 
 LIGHT_UNKNOWN = (

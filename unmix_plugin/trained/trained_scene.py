@@ -8,7 +8,7 @@ Notation: `H x W` pixels, `B` bands, `K` endmembers.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from dataclasses import field as dataclass_field
 from typing import Literal
@@ -20,17 +20,24 @@ from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
+from unmix_plugin.engine.registry import Output
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.field import CoefficientField
 from unmix_plugin.rendering.front_to_back import composite_view
 from unmix_plugin.rendering.renderer import VolumeRenderer
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.materials import Materials
+from unmix_plugin.spectral.materials import Coefficients, Materials
 from unmix_plugin.trained.measures import Scale
-from unmix_plugin.trained.outputs import MaterialOutput, MaterialView, available_outputs, find_output
-from unmix_plugin.trained.protocol import Probe
-from unmix_plugin.trained.run_views import RunView
+from unmix_plugin.trained.outputs import (
+    MaterialOutput,
+    MaterialView,
+    available_outputs,
+    components_of,
+    find_output,
+)
+from unmix_plugin.trained.protocol import Probe, RenderedView
+from unmix_plugin.trained.run_views import RunView, cameras_of
 
 
 def one_pixel(camera: Cameras, column: int, row: int) -> Cameras:
@@ -226,3 +233,48 @@ class TrainedScene:
         return replace(
             self, field=field, renderer=renderer, materials=self.materials.to(device), unedited=unedited
         )
+
+
+_NUM_CAMERAS = 6
+_NUM_RAYS = 6000
+"""Of reference rays: through so many of the training cameras, about so many in all."""
+
+
+@torch.no_grad()
+def reference_rays(scene: TrainedScene, cameras: Cameras) -> tuple[Coefficients, Float[Tensor, "N 3"]]:
+    """Coefficients of rays through some of the cameras, spread over all, and where they end, model space.
+
+    Colours of pictures are chosen by them, so that they mean the same from everywhere.
+    """
+    step, cameras = max(1, len(cameras) // _NUM_CAMERAS), cameras.one_size()
+    chosen = range(0, len(cameras), step)[:_NUM_CAMERAS]
+    aspect = cameras.width / cameras.height
+    height = max(1, min(cameras.height, int((_NUM_RAYS / len(chosen) / aspect) ** 0.5)))
+    parts, points = [], []
+    for index in chosen:
+        camera = cameras[index].resized(max(1, round(aspect * height)), height)
+        seen = scene.look(camera, subpixels=1).coefficients.flatten()
+        rays = camera.to(scene.device).image_rays(0)
+        parts.append(seen.map(lambda packed, is_seen=seen.is_occupied: packed[is_seen]))
+        points.append((rays.origins + seen.ray_distance[:, None] * rays.directions)[seen.is_occupied])
+    return Coefficients.concatenate(parts), torch.cat(points)
+
+
+def judged_together(outputs: Collection[Output], views: Sequence[RenderedView]) -> dict[str, Output]:
+    """By name: the outputs whose numbers are judged against all views, rather than each against itself; principal
+    components against the training views, as everywhere."""
+    seen = [view for view in views if isinstance(view, MaterialView)]
+    found: dict[str, Output] = {}
+    for output in outputs:
+        if not seen or not isinstance(output, MaterialOutput):
+            continue
+        scene = seen[0].scene
+        if output.name == "pca":
+            rays, _ = reference_rays(scene, cameras_of(scene.views, "train"))
+            found["pca"] = output.with_components(components_of(scene.materials, rays))
+        elif output.score is not None:
+            rows = [
+                view.materials.reflectance(view.coefficients)[view.coefficients.is_occupied] for view in seen
+            ]
+            found[output.name] = output.judged_against(torch.cat(rows))
+    return found

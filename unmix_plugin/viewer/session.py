@@ -17,12 +17,13 @@ from unmix_plugin.editing.apply import relighting_factors
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.training.progress import TrainingStatus
 from unmix_plugin.errors import ConfigError, SpectrumError
-from unmix_plugin.figures.pictures import ColourScale
+from unmix_plugin.figures.paint import ColourScale
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.colour.conversion import illuminant_names
 from unmix_plugin.spectral.library.material_library import MaterialLibrary, measured_library
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.model_scene import LightChoice, RelightableScene, relit
+from unmix_plugin.trained.run_materials import endmember_colours
 from unmix_plugin.trained.run_views import recorded_views
 from unmix_plugin.viewer.page import number, paragraph, reporting_failures
 from unmix_plugin.viewer.recipes import RecipeHistory, numbered
@@ -335,8 +336,7 @@ class Session:
 
     def colours_of(self, materials: Materials) -> list[tuple[float, ...]]:
         """sRGB colours that stand for materials."""
-        aids = self.services.maker.aids.for_layers(self.services.maker.edited(Edit()))
-        return [tuple(row) for row in aids.colours_of(materials).tolist()]
+        return [tuple(row) for row in endmember_colours(materials).tolist()]
 
     def change_edit(self, edit: Edit) -> None:
         """Show the scene with other materials or light; an UnmixError if the edit does not fit: nothing changes."""

@@ -36,7 +36,7 @@ from unmix_plugin.spectral.colour.conversion import agx
 from unmix_plugin.spectral.library.spectra_csv import read_spectra
 from unmix_plugin.trained.model_scene import LightChoice
 from unmix_plugin.trained.open_run import load_run, snapshot
-from unmix_plugin.viewer.rendering.painting import layers_of
+from unmix_plugin.viewer.rendering.painting import layers_of, paint_layer
 from unmix_plugin.viewer.rendering.settings import LayerSettings
 
 PBR, NO_PRIOR = "--pipeline.model.material=pbr", "--pipeline.model.prior=none"
@@ -230,8 +230,8 @@ def test_every_output_is_shown_from_the_run_folder_alone(scene):
 
 def test_the_viewer_paints_abundances_as_a_mixture_of_the_colours_of_the_segmentation(scene):
     view, layers = scene.look(scene.views[0].camera), layers_of(scene)
-    mixed, legend = layers["abundances"].paint(view, LayerSettings(), None)  # type: ignore[arg-type]
-    labelled, _ = layers["segmentation"].paint(view, LayerSettings(), None)  # type: ignore[arg-type]
+    both = [paint_layer(layers[name], view, LayerSettings(), None) for name in ("abundances", "segmentation")]
+    (mixed, labelled), legend = (one.over()[:, :, 0].float() for one in both), both[0].legend
     assert isinstance(legend, tuple)
     assert [name for name, _ in legend] == ["abundances 0", "abundances 1"]
     colours = torch.tensor([colour for _, colour in legend])

@@ -16,6 +16,7 @@ from tests.trained.camera_scenes import cameras_at
 from unmix_plugin.products.render.cameras import RenderCameras
 from unmix_plugin.products.render.files import FormattedOutput, choose_formats
 from unmix_plugin.products.render.job import RenderJob, Survey, take_survey
+from unmix_plugin.trained.outputs import values_of
 from unmix_plugin.trained.run_views import RunView
 
 SCENE = make_scene()
@@ -46,12 +47,9 @@ def render(
 def truth(cameras: RenderCameras, index: int, survey: Survey) -> dict[str, np.ndarray]:
     """What the scene itself renders of a view, all at once."""
     names = [product.output.name for product in choose_formats(["all"], [], SCENE, False)]
-    asked = [*(name for name in names if name != "pca"), "band:550nm", "false-colour:650,550,450"]
-    rendered = SCENE.render(cameras.views[index].camera, asked)
-    if survey.pca is not None:
-        seen = (rendered["accumulation"] > 0.5)[..., None]
-        rendered["pca"] = survey.pca(rendered["spectral"]) * seen
-    return {name: values.numpy() for name, values in rendered.items()}
+    asked = [*names, "band:550nm", "false-colour:650,550,450"]
+    view = SCENE.look(cameras.views[index].camera)
+    return {name: values_of(view, survey.outputs.get(name, SCENE.output(name))).numpy() for name in asked}
 
 
 def read_envi(base: Path) -> tuple[np.ndarray, dict[str, Any]]:

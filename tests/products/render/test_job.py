@@ -17,11 +17,13 @@ from unmix_plugin.figures.pictures import CanvasLayout
 from unmix_plugin.products.render.cameras import RenderCameras
 from unmix_plugin.products.render.files import still_paths
 from unmix_plugin.products.render.job import RenderJob, Survey, output_paths
+from unmix_plugin.trained.run_materials import endmember_colours
 from unmix_plugin.trained.run_views import RunView
 from unmix_plugin.trained.trained_scene import TrainedScene
 
 pytestmark = pytest.mark.usefixtures("no_wait_for_the_disk")
 
+COLOURS = endmember_colours(SCENE.materials)
 NUMBERS = ["all", "band:550nm", "false-colour:650,550,450"]
 
 
@@ -41,7 +43,7 @@ ENVI_NM = {
 }
 
 
-@pytest.mark.parametrize(("kind", "count"), [("npy", 20), ("envi", 19)])
+@pytest.mark.parametrize(("kind", "count"), [("npy", 22), ("envi", 21)])
 def test_numbers_are_what_the_model_renders_bit_for_bit(written, kind, count):
     folder, cameras, products, expected = written
     chosen = [product for product in products if product.format == kind]
@@ -133,8 +135,8 @@ def pictures(tmp_path_factory):
     """Pictures of three views, what they share, and what the scene itself renders of each."""
     folder, cameras = tmp_path_factory.mktemp("pictures"), views(3)
     outputs = ["rgb", "band:550nm", "depth", "segmentation", "abundances"]
-    _, survey, job = render(folder, outputs, ["png"], cameras)
-    return folder, survey, job, [(f"view.{index}", truth(cameras, index, survey)) for index in range(3)]
+    _, survey, _ = render(folder, outputs, ["png"], cameras)
+    return folder, survey, [(f"view.{index}", truth(cameras, index, survey)) for index in range(3)]
 
 
 def over_black(rgba):
@@ -145,7 +147,7 @@ def over_black(rgba):
 
 
 def test_pictures_have_straight_colours_and_the_models_opacity(pictures):
-    folder, _, _, expected = pictures
+    folder, _, expected = pictures
     for name, values in expected:
         rgba = iio.imread(folder / "rgb" / f"{name}.png")
         assert np.abs(rgba[..., 3] - 255 * values["accumulation"]).max() <= 0.5001
@@ -156,14 +158,14 @@ def test_pictures_have_straight_colours_and_the_models_opacity(pictures):
 
 
 def test_maps_have_one_known_range_and_ids_their_colours_in_all_views(pictures):
-    folder, survey, job, expected = pictures
-    scale = survey.scales["depth"]
-    assert 0 < scale.low < scale.high
+    folder, survey, expected = pictures
+    low, high = survey.ranges["depth"]
+    assert 0 < low < high
     for name, values in expected:
         with Image.open(folder / "depth" / f"{name}.png") as picture:
-            assert f"viridis from {scale.low:.6g} to {scale.high:.6g}" in picture.info["Description"]
+            assert f"viridis from {low:.6g} to {high:.6g}" in picture.info["Description"]
             rgba = np.asarray(picture)
-        fraction = np.clip((values["depth"] - scale.low) / (scale.high - scale.low), 0, 1)
+        fraction = np.clip((values["depth"] - low) / (high - low), 0, 1)
         shown = rgba[..., 3] > 0
         colours = np.round(255 * colormaps["viridis"](fraction)[..., :3])
         np.testing.assert_allclose(rgba[shown][:, :3], colours[shown], atol=1)  # a half is rounded either way
@@ -172,14 +174,14 @@ def test_maps_have_one_known_range_and_ids_their_colours_in_all_views(pictures):
             np.testing.assert_array_equal(np.asarray(picture), ids)
             rgba = np.asarray(picture.convert("RGBA"))
         seen = ids != 255
-        np.testing.assert_array_equal(rgba[seen][:, :3], np.round(255 * job.palette.colours[ids[seen]]))
+        np.testing.assert_array_equal(rgba[seen][:, :3], np.round(255 * COLOURS[ids[seen]]))
         assert not rgba[~seen][:, 3].any()
 
 
 def test_one_tile_for_each_endmember_stands_in_a_picture_of_abundances(pictures):
-    folder, _, job, [(name, values), *_] = pictures
+    folder, _, [(name, values), *_] = pictures
     rgba = iio.imread(folder / "abundances" / f"{name}.png")
-    layout = CanvasLayout.of((14, 11), job.palette.names)
+    layout = CanvasLayout.of((14, 11), SCENE.materials.names)
     assert rgba.shape[1::-1] == layout.size
     shares = values["abundances"] / np.maximum(values["accumulation"], 1e-6)[..., None]
     for index in range(3):
@@ -189,7 +191,7 @@ def test_one_tile_for_each_endmember_stands_in_a_picture_of_abundances(pictures)
         shown = tile[..., 3] > 0
         np.testing.assert_array_equal(tile[shown][:, :3], colours[shown])
         swatch = rgba[8, left + 6, :3]
-        np.testing.assert_array_equal(swatch, np.round(255 * job.palette.colours[index]))
+        np.testing.assert_array_equal(swatch, np.round(255 * COLOURS[index]))
 
 
 def test_a_moving_camera_makes_one_video_with_a_frame_a_view(tmp_path):
@@ -275,7 +277,7 @@ def test_indices_and_targets_are_those_of_the_rendered_spectra_in_every_block(tm
     cosine = spectra @ direction / (np.linalg.norm(spectra, axis=-1) * np.linalg.norm(direction) + 1e-12)
     np.testing.assert_allclose(read[angle][seen], np.arccos(np.clip(cosine[seen], -1, 1)), atol=1e-3)
     assert np.isfinite(read[matched][seen]).all()
-    assert set(survey.scores) == {INDEX, matched, angle}
+    assert set(survey.outputs) == {INDEX, matched, angle}
 
 
 def test_scores_of_ace_are_shown_over_the_range_that_they_have(tmp_path):
@@ -285,6 +287,6 @@ def test_scores_of_ace_are_shown_over_the_range_that_they_have(tmp_path):
     products, survey, _ = render(tmp_path, [coherence], ["npy"], cameras)
     values = np.stack([np.load(still_paths(tmp_path, products[0], one.name)[0]) for one in cameras.views])
     low, high = np.nanquantile(values, [0.01, 0.99])
-    shown = survey.scales[coherence]
-    assert shown.low == pytest.approx(low, abs=0.1 * (high - low))
-    assert shown.high == pytest.approx(high, abs=0.1 * (high - low))
+    shown = survey.ranges[coherence]
+    assert shown[0] == pytest.approx(low, abs=0.1 * (high - low))
+    assert shown[1] == pytest.approx(high, abs=0.1 * (high - low))

@@ -17,7 +17,6 @@ from unmix_plugin.products.render.cameras import choose_cameras
 from unmix_plugin.products.render.files import choose_formats
 from unmix_plugin.products.render.job import RenderJob, take_survey
 from unmix_plugin.products.render.maps import gdal_metadata, map_camera
-from unmix_plugin.products.render.pictures import Palette
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.trained.measures import Scale
 from unmix_plugin.trained.run_materials import endmember_colours
@@ -147,17 +146,17 @@ def test_heights_of_a_map_are_in_the_unit_of_its_coordinates_and_say_it(scale, u
     seen = view.opacity > 0.9
     relief = factor * np.ptp(view["depth"][seen].numpy())  # of half a ball, not known up to its edge
     assert 0.5 < relief / (factor * RADIUS / 0.25) < 1.05
-    assert survey.scales["depth"].high == pytest.approx(factor * view["depth"][seen].max().item(), rel=0.2)
+    assert survey.ranges["depth"][1] == pytest.approx(factor * view["depth"][seen].max().item(), rel=0.2)
 
 
 def test_more_than_a_tiff_can_hold_is_written_as_bigtiff(tmp_path, monkeypatch):
-    setting = files.RenderSetting(tmp_path, (4, 3), Palette.of(None, {}), {}, {}, None)
+    setting = files.RenderSetting(tmp_path, (4, 3), {}, {}, {}, None)
     [depth] = choose_formats(["depth"], ["tif"], SCENE, False)
     values = np.arange(12, dtype=np.float32).reshape(3, 4)
     for limit, is_big in ((48, False), (47, True)):
         monkeypatch.setattr(files, "_LARGEST_TIFF", limit)
         with files.still(files.still_paths(setting.folder, depth, "v")[0], depth, setting) as sink:
-            sink(files.Rows(0, {"depth": values, "accumulation": np.ones_like(values)}))
+            sink(files.Rows(0, {"depth": values}, {}, np.ones_like(values), np.ones_like(values)))
         with tifffile.TiffFile(tmp_path / "depth" / "v.tif") as file:
             assert file.is_bigtiff == is_big
             np.testing.assert_array_equal(file.asarray(), values)

@@ -12,6 +12,8 @@ from tests.products.render.render_factory import read_envi, read_exr, views
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.engine.registry import WORLD_UNITS, Output
 from unmix_plugin.errors import ConfigError
+from unmix_plugin.figures.look import Look
+from unmix_plugin.figures.paint import legend_of
 from unmix_plugin.products.render.files import choose_formats, needs_legend, still_paths, with_units
 from unmix_plugin.products.render.job import RenderJob, output_paths, take_survey
 from unmix_plugin.products.render.maps import MapInfo
@@ -110,12 +112,14 @@ def test_everything_that_it_shows_is_written_in_every_format(tmp_path, is_path):
     cameras = views(2, is_path=is_path)
     outputs = choose_formats(["all"], ["npy", "envi", "exr", "png", "mp4"], SCENE, is_path)
     survey = take_survey(SCENE, cameras.views, [one.output for one in outputs])
-    assert 290 < survey.scales["heat"].low < survey.scales["heat"].high < 310
+    assert 290 < survey.ranges["heat"][0] < survey.ranges["heat"][1] < 310
     job = RenderJob(SCENE, cameras, outputs, survey, tmp_path)
     job.render(job.blocks(30))
     for one in outputs:
         assert all(path.is_file() for path in output_paths(tmp_path, one, cameras))
-        assert not needs_legend(one, SCENE) or len(draw_legend(one.output, job.palette)) > 1000
+        if needs_legend(one, SCENE):
+            legend = legend_of(one.output, survey.ranges.get(one.output.name), Look())
+            assert len(draw_legend(one.output, legend)) > 1000
     for one in outputs:
         if one.format == "npy":
             [path] = still_paths(tmp_path, one, "view.1")

@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 
 from tests.products.report.page_outline import Outline, assert_self_contained
-from unmix_plugin.figures.pictures import NEUTRAL
+from unmix_plugin.figures.look import NEUTRAL
 from unmix_plugin.formats.files import eight_bits
 from unmix_plugin.products.report.pictures import (
     ReportViews,

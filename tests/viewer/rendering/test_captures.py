@@ -15,12 +15,15 @@ import tyro
 from tests.viewer.view_factory import make_frame, no_scene, some_pose
 from unmix_plugin.engine.geometry.key_poses import KeyPoses
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.products.render import RenderOptions
+from unmix_plugin.figures.paint import ColourScale
+from unmix_plugin.products.render import RenderOptions, files
 from unmix_plugin.products.render.files import choose_formats
+from unmix_plugin.products.render.job import setting_for, take_survey
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.model_scene import LightChoice
-from unmix_plugin.trained.outputs import find_output
+from unmix_plugin.trained.outputs import find_output, picture_values
+from unmix_plugin.trained.run_views import RunView
 from unmix_plugin.viewer.rendering import captures, render_loop
 from unmix_plugin.viewer.rendering.captures import VideoJob, VideoQueue
 from unmix_plugin.viewer.rendering.painting import LAYERS
@@ -124,16 +127,45 @@ def test_pictures_that_would_not_fit_are_refused():
         captures.check_size(4096, 4096, 31)
 
 
-@pytest.mark.parametrize("layer", [name for name in LAYERS if name not in captures._NO_VIDEO])
-def test_every_layer_that_renders_know_is_an_output_of_theirs(layer, source):
-    chosen = LayerSettings(layer, wavelength_nm=500.0, index="r650 / r500")
-    with source.locked() as scene:
-        products = choose_formats((captures.output_of(chosen, scene.bands),), ("mp4",), scene, True)
-    assert [product.format for product in products] == ["mp4"]
-    if layer in ("band", "false-colour"):  # the first settings are outputs for bands anywhere
-        bands = Bands.of([1000.0, 1200.0, 1400.0, 1600.0])
-        materials = Materials(bands, torch.full((2, 4), 0.5), torch.zeros(0, 4))
-        find_output(captures.output_of(replace(first_settings(bands), layer=layer), bands), materials)
+LOOKS = [
+    LayerSettings(),
+    LayerSettings(exposure=1.5, gamma=1.7, highlights="kept", background="black", colour_map="magma"),
+    LayerSettings(exposure=-0.3, background="white", value_range=(-1e-7, 0.3), colour_map="gray"),
+]
+
+
+@pytest.mark.parametrize("look", LOOKS)
+@pytest.mark.parametrize("layer", [name for name in LAYERS if name != "error"])
+def test_a_picture_of_a_render_is_the_page_pixel_for_pixel(services, source, tmp_path, layer, look):
+    """Videos are such pictures, from the same words of the command."""
+    chosen = replace(look, layer=layer, wavelength_nm=500.0, index="r650/r500", endmember=1)
+    frame = make_frame(source, sized_camera(some_pose(), 23, 17))
+    page = services.maker.paint(frame, chosen, False, False)
+    if isinstance(page.legend, ColourScale):  # as the panel does: each frame would have a range of its own
+        chosen = replace(chosen, value_range=(page.legend.low, page.legend.high))
+    name = LAYERS[layer].output_name(chosen, frame.materials.bands)
+    options = tyro.cli(
+        RenderOptions, args=captures.render_argv(tmp_path, tmp_path, name, chosen, tmp_path, None)
+    )
+    scene, views = frame.scene, (RunView("frame", frame.camera),)
+    outputs = [one._replace(format="png") for one in choose_formats(options.outputs, ("mp4",), scene, True)]
+    survey = take_survey(scene, views, [one.output for one in outputs], None, options.asked_look())
+    setting = replace(
+        setting_for(scene, frame.camera, [one.output for one in outputs], survey, tmp_path),
+        look=options.asked_look(),
+    )
+    drawn = []
+    with files.frame(outputs[0].output, 0.0, setting, drawn.append) as add:
+        painted = {name: picture_values(frame, survey.outputs.get(name, outputs[0].output))}
+        add(files.Rows(0, {}, painted, frame.opacity.numpy(), frame.coverage.numpy()))
+    np.testing.assert_array_equal(drawn[0], page.picture)
+
+
+@pytest.mark.parametrize("layer", ["band", "false-colour"])
+def test_the_first_settings_are_outputs_for_bands_anywhere(layer):
+    bands = Bands.of([1000.0, 1200.0, 1400.0, 1600.0])
+    materials = Materials(bands, torch.full((2, 4), 0.5), torch.zeros(0, 4))
+    find_output(LAYERS[layer].output_name(first_settings(bands), bands), materials)
 
 
 @pytest.mark.parametrize(
@@ -142,48 +174,35 @@ def test_every_layer_that_renders_know_is_an_output_of_theirs(layer, source):
         ("band", "band:1330nm"),  # shown for a wavelength in a gap of the bands
         ("false-colour", "false-colour:1330,1330,1000"),
         ("index", "absorption:650-700"),
+        ("diffuse", "diffuse_rgb"),
+        ("abundance", "abundance:1"),
+        ("depth", "depth"),
     ],
 )
 def test_an_output_goes_by_the_bands_that_are_shown_or_by_its_own_name(layer, output):
     bands = Bands.of([1000.0, 1010, 1020, 1330, 1340])
-    settings = LayerSettings(layer, 1200.0, (1335.0, 1200.0, 990.0), index="absorption:650-700")
-    assert captures.output_of(settings, bands) == output
-
-
-@pytest.mark.parametrize("layer", ["error", "index", "diffuse", "specular"])
-def test_what_is_no_output_is_refused(layer):
-    with pytest.raises(ConfigError, match=f"videos can't show the layer {layer}"):
-        captures.output_of(LayerSettings(layer), Bands.of([450.0, 550.0, 650.0]))
-
-
-@pytest.mark.parametrize(
-    ("settings", "expected"),
-    [
-        *(({"layer": layer}, []) for layer in ("rgb", "segmentation", "false-colour")),
-        *(({name: value}, ["exposure"]) for name, value in (("exposure_ev", 1.0), ("view_transform", "agx"))),
-        ({"layer": "segmentation", "exposure_ev": 1.0, "background": "black"}, ["light grey behind it"]),
-        *(({"layer": layer}, ["side by side"]) for layer in ("abundance", "abundances")),
-        ({"layer": "band", "colour_map": "magma"}, ["grey values"]),
-        ({"layer": "depth"}, ["range of its own"]),
-        ({"layer": "pca"}, ["principal components"]),
-    ],
-)
-def test_what_a_video_has_otherwise_than_the_page_is_said(settings, expected):
-    shown = LayerSettings(**settings)
-    found = captures.differences(shown, LAYERS[shown.layer].controls)
-    assert len(found) == len(expected)
-    assert all(words in said for words, said in zip(expected, found, strict=True))
+    settings = LayerSettings(
+        wavelength_nm=1200.0, false_colour_nm=(1335.0, 1200.0, 990.0), index="absorption:650-700", endmember=1
+    )
+    assert LAYERS[layer].output_name(settings, bands) == output
 
 
 def test_the_words_are_those_of_the_command(tmp_path):
-    paths = (tmp_path, tmp_path / "path.json", "rgb", tmp_path / "out", tmp_path / "recipe.yml")
+    paths = (
+        tmp_path,
+        tmp_path / "path.json",
+        "rgb",
+        LayerSettings(),
+        tmp_path / "out",
+        tmp_path / "recipe.yml",
+    )
     light = LightChoice("studio", rotation_deg=-30.0, exposure_stops=0.5)
     options = tyro.cli(RenderOptions, args=captures.render_argv(*paths, light))
     assert (options.run, options.cameras) == (tmp_path, str(tmp_path / "path.json"))
     assert (options.outputs, options.formats, options.overwrite) == (("rgb",), ("mp4",), True)
     assert (options.edits, options.environment) == (tmp_path / "recipe.yml", "studio")
     assert (options.environment_rotation, options.environment_exposure) == (-30.0, 0.5)
-    plain = tyro.cli(RenderOptions, args=captures.render_argv(*paths[:4], None))
+    plain = tyro.cli(RenderOptions, args=captures.render_argv(*paths[:5], None))
     assert (plain.edits, plain.environment) == (None, RenderOptions().environment)
 
 

@@ -11,22 +11,21 @@ from hypothesis import strategies as st
 from torch.testing import assert_close
 
 from tests.method_factory import with_a_sky
-from tests.viewer.view_factory import make_aids, make_frame, make_source, paint_layer, ring
-from unmix_plugin.engine.registry import Output
+from tests.viewer.view_factory import make_aids, make_frame, make_source, paint_layer
 from unmix_plugin.errors import ConfigError, SpectrumError
-from unmix_plugin.figures.pictures import ColourScale
-from unmix_plugin.products.render.pictures import Palette, opaque_tiles
+from unmix_plugin.figures.look import BACKGROUNDS
+from unmix_plugin.figures.paint import ColourScale, colour_table
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb
 from unmix_plugin.spectral.maps.indices import _MAX_LENGTH
 from unmix_plugin.spectral.materials import Coefficients
-from unmix_plugin.trained.model_scene import ModelView
+from unmix_plugin.trained import outputs
 from unmix_plugin.trained.run_materials import endmember_colours
-from unmix_plugin.viewer.rendering import painting, settings
-from unmix_plugin.viewer.rendering.painting import LAYERS, _to_display
+from unmix_plugin.viewer.rendering import settings
+from unmix_plugin.viewer.rendering.painting import LAYERS
 from unmix_plugin.viewer.rendering.scene import MeasuredViews
-from unmix_plugin.viewer.rendering.settings import BACKGROUNDS, LayerSettings
+from unmix_plugin.viewer.rendering.settings import LayerSettings
 
-names = st.sampled_from([entry.name for entry in fields(LayerSettings)])
+names = st.sampled_from([entry.name for entry in fields(LayerSettings) if entry.name != "mixed"])
 anything = st.recursive(
     st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text()),
     lambda inner: st.lists(inner, max_size=4),
@@ -39,13 +38,13 @@ def test_settings_are_always_valid(name, value):
     found = LayerSettings().changed(name, value)
     assert isinstance(found.layer, str)
     for number, bounds in (
-        (found.exposure_ev, settings.EXPOSURE_BOUNDS),
+        (found.exposure, settings.EXPOSURE_BOUNDS),
         (found.gamma, settings.GAMMA_BOUNDS),
     ):
         assert bounds[0] <= number <= bounds[1]
     assert found.background in BACKGROUNDS
     assert found.colour_map in settings.COLOUR_MAPS
-    assert found.view_transform in settings.VIEW_TRANSFORMS
+    assert found.highlights in settings.HIGHLIGHTS
     assert all(math.isfinite(value) for value in (found.wavelength_nm, *found.false_colour_nm))
     assert 0 <= found.endmember < 255
     assert len(found.index) <= 1000
@@ -56,7 +55,7 @@ def test_sound_values_are_taken_as_they_are_and_a_range_that_is_none_leaves_the_
     found = LayerSettings()
     sound = {"layer": "pca", "wavelength_nm": 610.0, "false_colour_nm": (700.0, 600.0, 500.0), "endmember": 4}
     sound |= {"index": "(r800-r670)/(r800+r670)", "colour_map": "magma", "value_range": (-1.0, 2.0)}
-    sound |= {"exposure_ev": -2.5, "gamma": 2.2, "view_transform": "agx", "background": "black"}
+    sound |= {"exposure": -2.5, "gamma": 2.2, "highlights": "kept", "background": "black"}
     for name, value in sound.items():
         found = found.changed(name, value)
         assert getattr(found, name) == value
@@ -71,36 +70,6 @@ def test_a_formula_that_is_too_long_stays_too_long_rather_than_becoming_another_
     kept = LayerSettings().changed("index", "r600" + " " * 2000 + "/ r650")
     assert kept.index == "r600 / r650"
     assert kept.changed("index", 3.0).index == "r600 / r650"
-
-
-greys = torch.logspace(-3, 2, 200)[:, None].expand(-1, 3)
-
-
-def test_the_srgb_transform_is_srgb_up_to_white_gamma_lifts_the_dark_and_a_stop_doubles_the_light():
-    light = torch.rand(50, 3, generator=torch.Generator().manual_seed(0))
-    plain = _to_display(light, 0.0, 1.0, "srgb")
-    assert_close(plain, linear_to_srgb(light))
-    assert_close(_to_display(light + 1, 0.0, 1.0, "srgb"), torch.ones(50, 3), atol=1e-6, rtol=0)
-    assert_close(_to_display(light, 0.0, 2.0, "srgb"), plain**0.5)
-    for stops in (-3.0, 0.5, 2.0):
-        assert_close(_to_display(light, stops, 1.0, "agx"), _to_display(light * 2**stops, 0.0, 1.0, "agx"))
-
-
-@pytest.mark.parametrize("transform", list(settings.VIEW_TRANSFORMS))
-def test_more_light_is_never_darker_and_grey_stays_grey(transform):
-    shown = _to_display(greys, 0.0, 1.0, transform)
-    assert (shown.diff(dim=0) >= -1e-6).all()
-    assert (shown.amax(dim=1) - shown.amin(dim=1)).max() < 1e-3
-    assert 0 <= shown.min() <= shown.max() <= 1
-
-
-def test_agx_shows_middle_grey_in_the_middle_tells_highlights_apart_and_lets_bright_colours_fade():
-    middle = _to_display(torch.full((1, 3), 0.18), 0.0, 1.0, "agx")
-    assert float(middle.mean()) == pytest.approx(0.5, abs=0.01)
-    bright = _to_display(torch.tensor([[1.0], [2.0], [4.0]]).expand(-1, 3), 0.0, 1.0, "agx")[:, 0]
-    assert bright.diff().min() > 0.03
-    dim, bright = _to_display(torch.tensor([[0.2, 0.0, 0.0], [16.0, 0.0, 0.0]]), 0.0, 1.0, "agx")
-    assert float(dim[1] / dim[0]) < 0.5 < 0.6 < float(bright[1] / bright[0])
 
 
 PAINTED = [name for name in LAYERS if name != "error"]
@@ -207,18 +176,6 @@ def test_pure_pixels_have_the_colours_of_all_figures(frame, aids):
         assert [name for name, _ in legend] == list(frame.materials.names)
 
 
-@pytest.mark.parametrize("classes", [(), (("clay", (0.8, 0.4, 0.2)), ("wax", (0.1, 0.2, 0.9)))])
-def test_labels_have_the_colours_and_the_names_that_they_have_in_renders(classes):
-    output = Output("segmentation", "labels", "segmentation", "what is there", classes=classes)
-    ids = torch.tensor([[0, 1, 7, 255]], dtype=torch.uint8)
-    view = ModelView(ring()[0], {"segmentation": ids, "accumulation": (ids != 255).float()})
-    picture, legend = painting._layer_of(output).paint(view, LayerSettings(), None)
-    expected = opaque_tiles(output, ids.numpy(), (ids != 255).float().numpy(), Palette.of(None, {}))[:, :, 0]
-    assert_close(picture, torch.from_numpy(expected / 255).float(), atol=0.003, rtol=0)
-    names = [name for name, _ in legend] if isinstance(legend, tuple) else legend
-    assert names == (["clay", "wax"] if classes else "what is there")
-
-
 @pytest.mark.parametrize("layer", [name for name in PAINTED if name != "accumulation"])
 def test_where_nothing_is_the_background_shows(frame, aids, layer):
     nothing = frame.map(torch.zeros_like)
@@ -244,7 +201,7 @@ def test_an_error_is_painted_where_it_is_known(frame, aids, monkeypatch):
     monkeypatch.setattr(MeasuredViews, "error", lambda *_: (values, is_known, "train_007"))
     known = replace(aids, measured=object.__new__(MeasuredViews))
     picture, legend = painted(frame, known, "error", value_range=(0.0, 0.1), background="white")
-    assert_close(picture[3, 4], painting._colour_table("viridis")[512], atol=0.01, rtol=0)
+    assert_close(picture[3, 4], torch.tensor(colour_table("viridis")[128]).float(), atol=0.01, rtol=0)
     assert_close(picture[0, 0], torch.ones(3))
     assert "train_007" in legend.label
 
@@ -254,19 +211,21 @@ FORMULA = "(r650-r450)/(r650+r450)"
 
 @pytest.mark.parametrize("light", [None, [0.2, 0.4, 0.6, 0.8, 1.0]])
 def test_an_index_is_the_output_of_renders_over_the_background(frame, aids, light, monkeypatch):
-    monkeypatch.setattr(painting, "_CHUNK", 100)  # fewer than there are pixels
+    monkeypatch.setattr(outputs, "_CHUNK", 100)  # fewer than there are pixels
     lit = replace(frame.materials, light=None if light is None else torch.tensor(light))
     shown = replace(frame, scene=replace(frame.scene, materials=lit))
     values = shown[f"index:{FORMULA}"]
     assert 0.05 < float(values.isnan().float().mean()) < 0.95
-    chosen = LayerSettings("index", index=FORMULA, value_range=(-1.0, 1.0), background="white")
+    chosen = LayerSettings(layer="index", index=FORMULA, value_range=(-1.0, 1.0), background="white")
     picture, legend = paint_layer(shown, chosen, aids)
     opacity = frame.coefficients.accumulation * values.isfinite()
-    solid_colours = painting._paint_values(values, (-1.0, 1.0), "viridis")
-    assert_close(picture, painting._over_background(solid_colours, opacity, chosen), atol=1e-5, rtol=0)
+    levels = ((values.nan_to_num() + 1) / 2 * 256).long().clamp(0, 255)
+    solid_colours = torch.from_numpy(colour_table("viridis")).float()[levels]
+    part = opacity[..., None]
+    assert_close(picture, solid_colours * part + 1 - part, atol=1e-5, rtol=0)
     assert_close(picture[values.isnan()], torch.ones_like(picture[values.isnan()]))
     assert isinstance(legend, ColourScale)
-    assert ("of radiance: light unknown" in legend.label) == (light is None)
+    assert ("of radiance, since the scene's light is unknown" in legend.label) == (light is None)
 
 
 @pytest.mark.parametrize(("chosen", "shown"), [(None, (-0.2, 0.2)), ((0.0, 0.1), (0.0, 0.1))])

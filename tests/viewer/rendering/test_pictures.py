@@ -119,5 +119,5 @@ def test_every_layer_shows_edits_of_gloss_and_of_what_is_there(tmp_path, edit):
     for layer in set(maker.layers) - {"error", "index"}:
         assert maker.paint(frame, LayerSettings(layer=layer), False, False).picture.shape == (8, 12, 3)
     aids = maker.aids.for_layers(maker.edited(change))
-    assert aids.reference_spectra(frame.materials).isfinite().all()
+    assert aids.reference_view(frame)["spectral"].isfinite().all()
     assert_close(aids.reference.abundances[:, 1].max() > 0, torch.tensor(not isinstance(edit, Remove)))

@@ -204,13 +204,13 @@ def test_what_was_measured_is_seen_lit_and_exposed_alike(views, scene, ball_of, 
 
 
 def test_an_error_is_shown_though_the_scene_was_read_late(views, scene, ball_of, source, monkeypatch):
-    camera, render = scene.cameras[scene.train_indices[1]], aids_module.render_reference
+    camera, render = scene.cameras[scene.train_indices[1]], aids_module.reference_rays
     aids = SceneAids(replace(source, take=lambda: ball_of(camera).scene))
 
     def slowly(*arguments):
         aids.measured = views
         return render(*arguments)
 
-    monkeypatch.setattr(aids_module, "render_reference", slowly)
+    monkeypatch.setattr(aids_module, "reference_rays", slowly)
     found: Any = aids.for_layers(ball_of(camera).scene)
     assert found.measured is views

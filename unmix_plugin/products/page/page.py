@@ -32,6 +32,7 @@ from unmix_plugin import __version__
 from unmix_plugin.editing.apply import relighting_factors
 from unmix_plugin.editing.recipe import Light
 from unmix_plugin.errors import ConfigError, SpectrumError
+from unmix_plugin.figures.paint import colour_table
 from unmix_plugin.formats.files import eight_bits, write_file
 from unmix_plugin.formats.libraries import library_of
 from unmix_plugin.products.mesh import find_surface
@@ -392,9 +393,7 @@ def rounded(values: Float[np.ndarray, "..."]) -> list[Any]:
 
 def _colour_map() -> list[list[int]]:
     """Of values from 0 to 1, in 256 steps of 8 bits: viridis."""
-    from matplotlib import colormaps
-
-    return np.round(255 * colormaps["viridis"](np.linspace(0, 1, 256))[:, :3]).astype(int).tolist()
+    return np.round(255 * colour_table("viridis")).astype(int).tolist()
 
 
 def _fill(facts: dict[str, Any], arrays: str, shown: dict[str, bytes]) -> bytes:

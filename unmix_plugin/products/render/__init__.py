@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import math
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 from unmix_plugin.errors import ConfigError
+from unmix_plugin.figures.look import Look
 from unmix_plugin.products.product import EditOptions, RunOptions, SharedViews, WriteOptions
 
 
 @dataclass(frozen=True)
-class RenderOptions(SharedViews, WriteOptions, EditOptions, RunOptions):
+class RenderOptions(Look, SharedViews, WriteOptions, EditOptions, RunOptions):
     """Render views of a trained run: spectra, pictures, maps and videos, from the run folder alone."""
 
     output: Path | None = None
@@ -23,12 +25,13 @@ class RenderOptions(SharedViews, WriteOptions, EditOptions, RunOptions):
     view: tuple[str, ...] = ()
     """Only these of the cameras, by name or by number from 0."""
     outputs: tuple[str, ...] = ()
-    """spectral, reflectance, continuum, derivative, second_derivative, rgb, linear_rgb, diffuse, specular, abundances,
-    material_scores, probe_probabilities, segmentation, confidence, depth, ray_distance, normals, accumulation, pca,
-    band:650nm, false-colour:860,650,550; index:ndvi or index:(r800-r670)/(r800+r670), target:paint.csv or
-    target:ace:paint.csv>0.5, library:mine.csv<0.1 or library:angle:mine.csv, absorption:650-700 (depth; or
-    absorption:centre:650-700, absorption:area:650-700); or all (but those with a colon). None given: spectral rgb
-    abundances segmentation depth for single views, rgb for a path."""
+    """spectral, reflectance, continuum, derivative, second_derivative, rgb, linear_rgb, diffuse, diffuse_rgb, specular,
+    specular_rgb, abundances, abundance:NAME, material_scores, probe_probabilities, segmentation, confidence, depth,
+    ray_distance, normals, accumulation, pca, band:650nm, false-colour:860,650,550; index:ndvi or
+    index:(r800-r670)/(r800+r670), target:paint.csv or target:ace:paint.csv>0.5, library:mine.csv<0.1 or
+    library:angle:mine.csv, absorption:650-700 (depth; or absorption:centre:650-700, absorption:area:650-700); or all
+    (but those with a colon). None given: spectral rgb abundances segmentation depth for single views, rgb for a
+    path."""
     formats: tuple[str, ...] = ()
     """envi, exr, npy, png, mp4, tif (GeoTIFF of maps); each output is written in those that suit it. None given:
     what suits each best. mp4 of spectra goes through the bands."""
@@ -54,6 +57,19 @@ class RenderOptions(SharedViews, WriteOptions, EditOptions, RunOptions):
     """Degrees by which the environment is turned about the world's +z."""
     environment_exposure: float = 0.0
     """Stops by which the environment is brighter."""
+
+    def asked_look(self) -> Look:
+        """How pictures show it; a ConfigError where a number makes no sense."""
+        if not (math.isfinite(self.exposure) and math.isfinite(self.gamma) and self.gamma > 0):
+            raise ConfigError(
+                f"--exposure {self.exposure:g} and --gamma {self.gamma:g}: expected finite numbers, gamma above 0"
+            )
+        low, high = self.value_range or (0.0, 1.0)
+        if not (math.isfinite(low) and math.isfinite(high) and low < high):
+            raise ConfigError(
+                f"--value-range {low:g} {high:g}: expected two finite numbers, the lower one first"
+            )
+        return Look(**{one.name: getattr(self, one.name) for one in fields(Look)})
 
     def asked_size(self) -> tuple[int, int] | None:
         """Width and height that --size says; a ConfigError where it does not say them."""

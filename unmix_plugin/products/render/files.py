@@ -17,26 +17,31 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
+from jaxtyping import UInt8
 
 from unmix_plugin.engine.registry import METRES, WORLD_UNITS, Output, OutputKind
 from unmix_plugin.errors import ConfigError, did_you_mean
+from unmix_plugin.figures.look import Look
+from unmix_plugin.figures.paint import (
+    LIGHT_KINDS,
+    as_bytes,
+    background_of,
+    class_colours,
+    describe,
+    id_palette,
+    paint,
+)
 from unmix_plugin.figures.pictures import Canvas, CanvasLayout
 from unmix_plugin.formats.envi import envi_cube_paths, envi_cube_rows
 from unmix_plugin.formats.exr import layer_names, write_exr, write_spectral_exr
 from unmix_plugin.formats.files import indexed_png_bytes, npy_rows, rgba_png_bytes, safe_name, write_file
 from unmix_plugin.formats.video import FrameSink, video_frames
 from unmix_plugin.products.render.maps import MapInfo, gdal_metadata
-from unmix_plugin.products.render.pictures import (
-    LIGHT_KINDS,
-    Palette,
-    opaque_band,
-    opaque_tiles,
-    transparent_tiles,
-)
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import rgb_matrix
 from unmix_plugin.spectral.maps.indices import NAMED_INDICES
 from unmix_plugin.spectral.segmentation import NOTHING_ID
+from unmix_plugin.trained.outputs import PictureValues
 from unmix_plugin.trained.protocol import RenderableScene
 
 _Format = Literal["envi", "exr", "npy", "png", "mp4", "tif"]
@@ -197,10 +202,6 @@ def _format(name: str) -> _Format:
 _SWEEP_SECONDS, _SWEEP_FPS = 6.0, (4.0, 24.0)
 
 
-COVERAGE = "coverage"
-"""Name among the values of rows of how much of each pixel shows something, a sky included."""
-
-
 @dataclass(frozen=True)
 class Rows:
     """Some rows of a view."""
@@ -208,11 +209,18 @@ class Rows:
     first: int
     """Row of the first of them."""
     values: dict[str, np.ndarray]
-    """Outputs by name, (h, W, ...) float32, ids uint8; `accumulation` and `coverage` are always there."""
+    """Numbers by output, (h, W, ...) float32, ids uint8: of outputs in formats that hold numbers."""
+    painted: dict[str, PictureValues]
+    """By output: what pictures are painted from."""
+    opacity: np.ndarray
+    """(h, W) float32, [0, 1]."""
+    coverage: np.ndarray
+    """(h, W) float32, [0, 1]: how much of each pixel shows something, a sky included."""
 
-    def _filled_by(self, output: Output) -> np.ndarray:
-        """(h, W) float32, [0, 1]: how much of each pixel an output fills: light also comes from the sky."""
-        return self.values[COVERAGE if output.kind in LIGHT_KINDS | {"channels"} else "accumulation"]
+
+def is_painted(formatted: FormattedOutput) -> bool:
+    """Whether a file shows colours rather than numbers: PNG of ids has numbers, with a palette."""
+    return formatted.format == "mp4" or (formatted.format == "png" and formatted.output.kind != "labels")
 
 
 RowsSink: TypeAlias = Callable[[Rows], None]
@@ -227,7 +235,8 @@ class RenderSetting:
     """Where they go."""
     size: tuple[int, int]
     """Width and height of a view in pixels."""
-    palette: Palette
+    ranges: dict[str, tuple[float, float]]
+    """Values at the ends of the colours of outputs whose range only the views tell, by output."""
     bands: dict[str, Bands]
     """Of each output whose channels are bands."""
     channels: dict[str, tuple[str, ...]]
@@ -238,6 +247,8 @@ class RenderSetting:
     """Where a map lies."""
     label: str = ""
     """Of what the numbers are, in ENVI and EXR files; empty: the output's name."""
+    look: Look = Look()
+    """How pictures show it."""
 
     def described(self, output: Output) -> str:
         """What the numbers of a file are."""
@@ -281,34 +292,41 @@ def frame(output: Output, progress: float, setting: RenderSetting, add: FrameSin
         names = setting.channels[output.name]
         band = round(progress * (len(names) - 1))
         canvas = Canvas(_layout(output, setting), 3, [names[band]])
-        yield lambda rows: canvas.put(
-            rows.first, opaque_band(rows.values[output.name][..., band], rows._filled_by(output))
-        )
+        yield lambda rows: canvas.put(rows.first, _band_tile(rows.painted[output.name], band, setting.look))
     else:
-        canvas, put = _picture(output, setting, opaque_tiles)
+        canvas, put = _picture(output, setting, is_opaque=True)
         yield put
     add(canvas.pixels)
 
 
-def _picture(
-    output: Output, setting: RenderSetting, paint: Callable[..., np.ndarray]
-) -> tuple[Canvas, RowsSink]:
-    """A canvas, and a sink that paints rows on it as opaque or as transparent tiles."""
-    palette, captions, swatches = setting.palette, (), ()
-    if output.kind == "shares":
+_BAND = Output("band", "grey", "one band", "light of one band")
+
+
+def _band_tile(channels: PictureValues, band: int, look: Look) -> UInt8[np.ndarray, "h W 1 3"]:
+    """One band of a spectrum on black as grey."""
+    painted = paint(_BAND, channels.values[..., band], channels.opacity, look=replace(look, colour_map=None))
+    return as_bytes(painted.over(background_of(look)))
+
+
+def _picture(output: Output, setting: RenderSetting, *, is_opaque: bool) -> tuple[Canvas, RowsSink]:
+    """A canvas, and a sink that paints rows on it, opaque or with opacity."""
+    look, captions, swatches = setting.look, (), ()
+    if output.kind == "shares" and not look.mixed:
         captions = setting.channels[output.name]
-        swatches = palette.colours if palette.names else ()
-    canvas = Canvas(_layout(output, setting), 3 if paint is opaque_tiles else 4, captions, swatches)
+        swatches = [colour for _, colour in output.classes]
+    canvas = Canvas(_layout(output, setting), 3 if is_opaque else 4, captions, swatches)
 
     def put(rows: Rows) -> None:
-        canvas.put(rows.first, paint(output, rows.values[output.name], rows._filled_by(output), palette))
+        given = rows.painted[output.name]
+        painted = paint(given.output, given.values, given.opacity, setting.ranges.get(output.name), look)
+        canvas.put(rows.first, as_bytes(painted.over(background_of(look))) if is_opaque else painted.rgba())
 
     return canvas, put
 
 
 def _layout(output: Output, setting: RenderSetting) -> CanvasLayout:
     """One tile, or one for each share under its name; of spectra, one band at a time under its wavelength."""
-    if output.kind not in ("channels", "shares"):
+    if output.kind not in ("channels", "shares") or (output.kind == "shares" and setting.look.mixed):
         return CanvasLayout.of(setting.size)
     count = 1 if output.kind == "channels" else None
     return CanvasLayout.of(setting.size, setting.channels[output.name], count)
@@ -325,7 +343,7 @@ def _whole(output: Output, setting: RenderSetting) -> tuple[RowsSink, np.ndarray
         values = rows.values[output.name].reshape(-1, width, count)
         place = slice(rows.first, rows.first + len(values))
         planes[:, place] = np.moveaxis(values, -1, 0)
-        filled[place] = rows._filled_by(output)
+        filled[place] = rows.coverage if output.kind in LIGHT_KINDS | {"channels"} else rows.opacity
 
     return add, planes, filled
 
@@ -382,7 +400,7 @@ def _tif(output: Output, path: Path, setting: RenderSetting) -> Iterator[RowsSin
     }
     palette = None
     if output.kind == "labels":
-        palette = np.round(65535 * setting.palette.by_id(output).T).astype(np.uint16)
+        palette = np.round(65535 * id_palette(class_colours(output)).T).astype(np.uint16)
     with _require_tifffile().TiffWriter(buffer, bigtiff=planes.nbytes > _LARGEST_TIFF) as writer:
         writer.write(
             planes,
@@ -428,13 +446,13 @@ def _exr_names(output: Output, setting: RenderSetting) -> list[str]:
 
 @contextmanager
 def _png(output: Output, path: Path, setting: RenderSetting) -> Iterator[RowsSink]:
-    palette, about = setting.palette, setting.palette.describe(output)
+    about = describe(output, setting.ranges.get(output.name), setting.look)
     if output.kind == "labels":
         add, planes, _ = _whole(output, setting)
         yield add
-        data = indexed_png_bytes(planes[0], palette.by_id(output), NOTHING_ID, about)
+        data = indexed_png_bytes(planes[0], id_palette(class_colours(output)), NOTHING_ID, about)
     else:
-        canvas, put = _picture(output, setting, transparent_tiles)
+        canvas, put = _picture(output, setting, is_opaque=setting.look.background is not None)
         yield put
         data = rgba_png_bytes(canvas.pixels, about)
     write_file(path, data)
@@ -443,12 +461,13 @@ def _png(output: Output, path: Path, setting: RenderSetting) -> Iterator[RowsSin
 @contextmanager
 def _sweep(output: Output, path: Path, setting: RenderSetting) -> Iterator[RowsSink]:
     """Band after band of one view."""
-    add, planes, filled = _whole(output, setting)
-    yield add
+    rows_kept: list[Rows] = []
+    yield rows_kept.append
     names, layout = setting.channels[output.name], _layout(output, setting)
     usual = float(np.clip(len(names) / _SWEEP_SECONDS, *_SWEEP_FPS))
     with video_frames(path, *layout.size, setting.frames_per_second or usual) as show:
-        for name, radiance in zip(names, planes, strict=True):
+        for band, name in enumerate(names):
             canvas = Canvas(layout, 3, [name])
-            canvas.put(0, opaque_band(radiance, filled))
+            for rows in rows_kept:
+                canvas.put(rows.first, _band_tile(rows.painted[output.name], band, setting.look))
             show(canvas.pixels)

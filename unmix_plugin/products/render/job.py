@@ -8,6 +8,7 @@ puts the frames of a round into the videos.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
@@ -23,31 +24,29 @@ from torch import Tensor
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.processes import ALONE, Processes
 from unmix_plugin.engine.registry import METRES, Output
-from unmix_plugin.figures.pictures import ColourScale
+from unmix_plugin.figures.look import Look
+from unmix_plugin.figures.paint import needs_range
 from unmix_plugin.formats.video import FrameSink
 from unmix_plugin.products.render.cameras import RenderCameras
 from unmix_plugin.products.render.files import (
-    COVERAGE,
     FormattedOutput,
     RenderSetting,
     Rows,
     RowsSink,
     frame,
+    is_painted,
     still,
     still_paths,
     video,
     video_path,
 )
 from unmix_plugin.products.render.maps import MapInfo
-from unmix_plugin.products.render.pictures import Palette, scale_of
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION
-from unmix_plugin.spectral.subspace import PcaColours
-from unmix_plugin.trained.outputs import usual_range
+from unmix_plugin.trained.outputs import picture_values, usual_range, values_of
 from unmix_plugin.trained.protocol import RenderableScene
-from unmix_plugin.trained.reflectance_maps import Score, is_reflectance_map, parse_reflectance_map
+from unmix_plugin.trained.reflectance_maps import is_reflectance_map
 from unmix_plugin.trained.run_views import RunView
-from unmix_plugin.trained.trained_scene import one_pixel
+from unmix_plugin.trained.trained_scene import judged_together, one_pixel
 
 _MOST_VIEWS = 12
 _PIXELS = 32 * 32
@@ -58,48 +57,40 @@ _PIXELS = 32 * 32
 class Survey:
     """What all pictures of a render share."""
 
-    scales: dict[str, ColourScale] = field(default_factory=dict)
-    """Colours of outputs whose range only the views tell, by output."""
-    pca: PcaColours | None = None
-    """Colours of the output `pca` of a scene of materials, if asked for."""
-    scores: dict[str, Score] = field(default_factory=dict)
-    """From reflectance to each index and target that is asked for."""
+    ranges: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """Values at the ends of the colours of outputs whose range only the views tell, by output."""
+    outputs: dict[str, Output] = field(default_factory=dict)
+    """By name: those whose numbers are judged against all views rather than each against itself."""
 
 
-def needs_survey(outputs: Collection[Output]) -> bool:
+def needs_survey(outputs: Collection[Output], look: Look = Look()) -> bool:  # noqa: B008 - a frozen value
     """Whether pictures of `outputs` share anything that has to be found out first."""
     return any(
-        output.name == "pca" or is_reflectance_map(output.name) or _is_ranged(output) for output in outputs
+        output.name == "pca" or is_reflectance_map(output.name) or needs_range(output, look)
+        for output in outputs
     )
 
 
 def take_survey(
-    scene: RenderableScene, views: Sequence[RunView], outputs: Collection[Output], info: MapInfo | None = None
+    scene: RenderableScene,
+    views: Sequence[RunView],
+    outputs: Collection[Output],
+    info: MapInfo | None = None,
+    look: Look = Look(),  # noqa: B008 - a frozen value
 ) -> Survey:
     """Look at up to twelve views, evenly spread over all, and find what `outputs` of all views, or of the map of
-    `info`, share."""
-    if not needs_survey(outputs):
+    `info`, share; principal components are those of the training views, as the viewer shows them."""
+    if not needs_survey(outputs, look):
         return Survey()
     scene = _lit_for(scene, info)
-    maps = [output for output in outputs if is_reflectance_map(output.name)]
-    ranged = [output for output in outputs if _is_ranged(output) and output not in maps]
-    has_pca = any(output.name == "pca" for output in outputs)
-    materials = scene.materials
-    spectra = ["spectral"] if materials is not None and (maps or has_pca) else []
-    seen = _seen(scene, views, [*(output.name for output in ranged), *spectra])
-    scales = {
-        output.name: scale_of(output, *usual_range(seen[output.name] * _units(output, info)))
-        for output in ranged
-    }
-    if materials is None or not spectra:
-        return Survey(scales)
-    reflectance = materials.reflectance_of(seen["spectral"], seen["accumulation"])
-    bands, lit = materials.bands, materials.is_lit
-    scores = {output.name: parse_reflectance_map(output.name, bands, lit).fit(reflectance) for output in maps}
-    for output in maps:
-        if output.value_range is None and output.kind == "map":
-            scales[output.name] = scale_of(output, *usual_range(scores[output.name](reflectance)))
-    return Survey(scales, PcaColours.fit(seen["spectral"]) if has_pca else None, scores)
+    looked = [scene.look(view.camera.shrunk(_PIXELS)) for view in views[:: -(-len(views) // _MOST_VIEWS)]]
+    own, ranges = judged_together(outputs, looked), dict[str, tuple[float, float]]()
+    for output in outputs:
+        if needs_range(output, look):
+            seen = torch.cat([picture_values(view, own.get(output.name, output)).seen for view in looked])
+            least = 0.0 if output.kind == "grey" else math.inf
+            ranges[output.name] = usual_range(seen * _units(output, info), least)
+    return Survey(ranges, own)
 
 
 def _lit_for(scene: RenderableScene, info: MapInfo | None) -> RenderableScene:
@@ -111,24 +102,6 @@ def _units(output: Output, info: MapInfo | None) -> float:
     """What an output's numbers are multiplied with to be in the unit that it says."""
     metres = None if info is None else info.metres_per_unit
     return 1.0 if metres is None or output.unit != METRES else metres
-
-
-def _is_ranged(output: Output) -> bool:
-    """Whether only the views tell between which values an output's colours go."""
-    return output.kind in ("map", "shares") and output.value_range is None
-
-
-def _seen(scene: RenderableScene, views: Sequence[RunView], outputs: Sequence[str]) -> dict[str, Tensor]:
-    """Outputs and `accumulation` of the pixels in which something is, of all views looked at, on the CPU."""
-    every = -(-len(views) // _MOST_VIEWS)
-    found: dict[str, list[Tensor]] = {name: [] for name in (*outputs, "accumulation")}
-    for view in views[::every]:
-        looked = scene.look(view.camera.shrunk(_PIXELS))
-        occupied = looked.opacity > OCCUPIED_ACCUMULATION
-        for name in outputs:
-            found[name].append(looked[name][occupied].cpu())
-        found["accumulation"].append(looked.opacity[occupied].cpu())
-    return {name: torch.cat(parts) for name, parts in found.items()}
 
 
 _PATH_FPS, _VIEWS_FPS = 24.0, 2.0
@@ -157,24 +130,26 @@ class RenderJob:
         survey: Survey,
         folder: Path,
         processes: Processes = ALONE,
+        look: Look = Look(),  # noqa: B008 - a frozen value
     ) -> None:
         """Of a scene of any method; `survey` is of these cameras and outputs, and each process has a job like this."""
         scene = _lit_for(scene, cameras.map_info)
         self._scene, self._cameras, self._survey, self._processes = scene, cameras, survey, processes
-        asked = [one.output for one in outputs]
+        asked = list(dict.fromkeys(one.output for one in outputs))
         setting = setting_for(scene, cameras.views[0].camera, asked, survey, folder)
         self._setting = replace(
-            setting, frames_per_second=cameras.frames_per_second, map_info=cameras.map_info
+            setting, frames_per_second=cameras.frames_per_second, map_info=cameras.map_info, look=look
         )
-        self.palette = self._setting.palette
-        """The colours of the pictures."""
         self._moving = [one for one in outputs if is_video_of_all(one, cameras)]
         self._still = [one for one in outputs if one not in self._moving]
         self._units = {output.name: _units(output, cameras.map_info) for output in asked}
-        # What all views share is computed here, from spectra.
-        own = {*survey.scores, *(["pca"] if survey.pca is not None else [])}
-        names = dict.fromkeys("spectral" if output.name in own else output.name for output in asked)
-        self._asked = [name for name in names if name != "accumulation"]
+        own = {output.name: survey.outputs.get(output.name, output) for output in asked}
+        self._painted = [
+            own[name] for name in dict.fromkeys(one.output.name for one in outputs if is_painted(one))
+        ]
+        self._numbers = [
+            own[name] for name in dict.fromkeys(one.output.name for one in outputs if not is_painted(one))
+        ]
 
     def blocks(self, pixels: int | None = None) -> list[_Block]:
         """All that this process is to render, in blocks of at most so many pixels; None: what keeps numbers few."""
@@ -220,7 +195,7 @@ class RenderJob:
                         add = partial(drawn.__setitem__, place)
                         sinks.append(of_view.enter_context(frame(one.output, progress, setting, add)))
                     for block in parts:
-                        rows = Rows(block.first_row, self._values(block.camera))
+                        rows = self._rows(block)
                         for sink in sinks:
                             sink(rows)
                 self._end_round(drawn, videos)
@@ -242,19 +217,22 @@ class RenderJob:
                     if drawn_frame is not None:
                         add(drawn_frame)
 
-    def _values(self, camera: Cameras) -> dict[str, np.ndarray]:
-        view = self._scene.look(camera)
-        rendered = {name: view[name] for name in self._asked}
-        rendered |= {name: view[name] * unit for name, unit in self._units.items() if unit != 1.0}
-        rendered["accumulation"] = opacity = view.opacity
-        rendered[COVERAGE] = view.coverage
-        if self._survey.pca is not None:
-            seen = (opacity > OCCUPIED_ACCUMULATION)[..., None]
-            rendered["pca"] = self._survey.pca(rendered["spectral"].cpu()) * seen.cpu()
-        if self._survey.scores and (materials := self._scene.materials) is not None:
-            reflectance = materials.reflectance_of(rendered["spectral"].cpu(), opacity.cpu())
-            rendered |= {name: score(reflectance) for name, score in self._survey.scores.items()}
-        return {name: values.detach().cpu().numpy() for name, values in rendered.items()}
+    @torch.no_grad()
+    def _rows(self, block: _Block) -> Rows:
+        view, units = self._scene.look(block.camera), self._units
+        numbers = {one.name: values_of(view, one) for one in self._numbers}
+        painted = {one.name: picture_values(view, one) for one in self._painted}
+        return Rows(
+            block.first_row,
+            {name: _in_unit(values, units[name]).detach().cpu().numpy() for name, values in numbers.items()},
+            {name: replace(one, values=_in_unit(one.values, units[name])) for name, one in painted.items()},
+            view.opacity.cpu().numpy(),
+            view.coverage.cpu().numpy(),
+        )
+
+
+def _in_unit(values: Tensor, unit: float) -> Tensor:
+    return values if unit == 1.0 else values * unit
 
 
 def is_video_of_all(formatted: FormattedOutput, cameras: RenderCameras) -> bool:
@@ -292,5 +270,4 @@ def setting_for(
             names[output.name] = tuple(f"{output.title} {index}" for index in range(pixel.shape[-1]))
         else:
             names[output.name] = materials.names
-    palette = Palette.of(materials, survey.scales)
-    return RenderSetting(folder, camera.size(0), palette, bands, names)
+    return RenderSetting(folder, camera.size(0), survey.ranges, bands, names)

@@ -16,11 +16,12 @@ import numpy as np
 import torch
 from jaxtyping import Float64, UInt8
 
-from unmix_plugin.figures.pictures import ColourScale, id_palette, over_neutral, paint
+from unmix_plugin.engine.registry import Output
+from unmix_plugin.figures.paint import ColourScale, as_bytes, colour_table, paint, scale_of
 from unmix_plugin.figures.plotting import RIGHT, WRONG, ChartLine, Colour, SpectraChart, css_colour
 from unmix_plugin.formats.files import eight_bits
 from unmix_plugin.products.evaluation import material_look
-from unmix_plugin.products.views import SHARE_SCALE
+from unmix_plugin.products.views import SHARE, paint_ids
 from unmix_plugin.spectral.library.material_library import MaterialLibrary
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.spectral.metrics import match_endmembers
@@ -33,7 +34,8 @@ from unmix_plugin.trained.run_materials import endmember_colours, shown_matches
 SHOWN_VIEWS = 3
 NEAR_RAD = 0.1
 """Spectral angle above which the nearest known material is no match."""
-ERROR_SCALE = ColourScale("magma", 0.0, 0.1, "root mean squared error over bands")
+_ERROR = Output("error", "map", "error", "root mean squared error over bands", (0.0, 0.1), "magma")
+ERROR_SCALE = scale_of(_ERROR)
 """Colours of errors of spectra."""
 _MAP_COLUMNS = (7, 6, 5)
 _STYLES = (("dashed", "#4b545c"), ("dotted", "#7a838b"), ("solid", "#a2aab1"))
@@ -91,8 +93,8 @@ class ReportViews:
             is_seen = view.segmentation.numpy() != NOTHING_ID  # elsewhere nothing is said of a material
             self._sure += float((as_numpy(view.confidence) * opacity)[is_seen].sum())
             self._seen += float(opacity[is_seen].sum())
-        maps = np.moveaxis(as_numpy(view.shares), -1, 0) if name in self._with_shares else ()
-        shares = tuple(eight_bits(over_neutral(paint(one, SHARE_SCALE), opacity)) for one in maps)
+        maps = view.shares.unbind(dim=-1) if name in self._with_shares else ()
+        shares = tuple(as_bytes(paint(SHARE, one, opacity).over()[:, :, 0]) for one in maps)
         spectra = view.spectra if truth is None else truth.shown(view)
         predicted = eight_bits(picture(spectra, view.coverage, bands))
         given = (name, predicted, view.segmentation.numpy(), shares)
@@ -134,9 +136,9 @@ class ReportViews:
         self._squares += (difference[matter] ** 2).sum(axis=0)
         self._offsets += difference[matter].sum(axis=0)
         self._pixels += int(matter.sum())
-        painted = paint(np.sqrt((difference**2).mean(axis=-1)), ERROR_SCALE)
         seen = np.maximum(as_numpy(view.coverage), as_numpy(truth.opacity)) > 0.01
-        return eight_bits(over_neutral(painted, (seen & truth.valid.numpy()).astype(np.float64)))
+        counted = (seen & truth.valid.numpy()).astype(np.float64)
+        return as_bytes(paint(_ERROR, np.sqrt((difference**2).mean(axis=-1)), counted).over()[:, :, 0])
 
 
 class _CaptionedPicture(NamedTuple):
@@ -189,7 +191,9 @@ def map_columns(count: int) -> int:
 
 def scale_strip(scale: ColourScale) -> np.ndarray:
     """The colours of a scale from low to high, (12, 220, 3)."""
-    return np.repeat(paint(np.linspace(scale.low, scale.high, 220)[None], scale), 12, axis=0)
+    return np.repeat(
+        colour_table(scale.colour_map)[np.linspace(0, 255, 220).round().astype(int)][None], 12, axis=0
+    )
 
 
 def error_chart(views: ReportViews) -> SpectraChart | None:
@@ -210,9 +214,9 @@ def segmentation_section(views: ReportViews) -> dict[str, Any]:
     evaluation, chosen = views.evaluation, evenly(views.shown, SHOWN_VIEWS)
     if evaluation is None or not any(view.labels is not None for view in chosen):
         names, colours = views.materials.names, endmember_colours(views.materials)
-        palette = id_palette(dict(enumerate(colours)))
         pictures = [
-            _CaptionedPicture(palette[view.ids], view.name, f"{view.name}, materials") for view in chosen
+            _CaptionedPicture(paint_ids(view.ids, names, colours), view.name, f"{view.name}, materials")
+            for view in chosen
         ]
         return {"pictures": pictures, "legend": list(zip(names, colours, strict=True)), "scores": []}
     scores, look = evaluation.segmentation(), material_look(evaluation)

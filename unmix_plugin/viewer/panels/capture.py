@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,14 +24,13 @@ from unmix_plugin.viewer.rendering.captures import (
     SIDE_BOUNDS,
     VideoJob,
     check_size,
-    differences,
     joined_strips,
-    output_of,
     render_argv,
     strip_of_spectra,
     write_spectra,
 )
 from unmix_plugin.viewer.rendering.painting import layer_named
+from unmix_plugin.viewer.rendering.settings import LayerSettings
 from unmix_plugin.viewer.session import Session
 from unmix_plugin.viewer.view_cameras import ViewPose, camera_of, path_poses, sized_camera
 
@@ -91,15 +91,18 @@ class CapturePanel:
 
     def _save_picture(self) -> None:
         camera = self._camera()
-        settings, maker = self._session.view.settings, self._session.services.maker
-        if self._session.value_range_shown is not None:  # strips would each have a scale of their own
-            settings = settings.changed("value_range", self._session.value_range_shown)
+        settings, maker = self._settings_shown(), self._session.services.maker
         name, what = self._name.value, f"{settings.layer}, {camera.width} x {camera.height} pixels"
         self._begin(
             camera,
             lambda strip: (maker.paint(strip, settings, False, False).picture,),
             lambda picture: write_file(self._new_file(name, ".png"), rgba_png_bytes(picture[0], what)),
         )
+
+    def _settings_shown(self) -> LayerSettings:
+        """What the page shows, with the ends of its colours: strips and frames would each have others of their own."""
+        settings, ends = self._session.view.settings, self._session.value_range_shown
+        return settings if ends is None else replace(settings, value_range=ends)
 
     def _save_spectra(self) -> None:
         materials = self._session.materials()
@@ -206,8 +209,14 @@ class CapturePanel:
         session, services = self._session, self._session.services
         if self._video is not None:
             raise ConfigError("a video is being rendered already; wait for it or cancel it")
-        settings = session.view.settings
-        output = output_of(settings, session.materials().bands if services.has_materials else None)
+        settings, bands = self._settings_shown(), None
+        if settings.layer == "error":
+            raise ConfigError(
+                "videos can't show the layer error, which is against one training view; choose another one"
+            )
+        if services.has_materials:
+            bands = session.materials().bands
+        output = layer_named(settings.layer, services.maker.layers).output_name(settings, bands)
         check_size(_side(self._width), _side(self._height))
         cameras = self._save_path()
         recipe = None
@@ -215,7 +224,9 @@ class CapturePanel:
             text = recipe_to_yaml(session.view.edit.recipe).encode()
             recipe = write_file(cameras.with_suffix(".yml"), text)
         folder = cameras.with_suffix("")
-        argv = render_argv(services.source.run.path, cameras, output, folder, recipe, session.view.edit.light)
+        argv = render_argv(
+            services.source.run.path, cameras, output, settings, folder, recipe, session.view.edit.light
+        )
         show = partial(self._show_progress, self._video_progress)
 
         def done(video: Path | None, reason: str) -> None:
@@ -228,12 +239,10 @@ class CapturePanel:
 
         self._video = VideoJob(argv, folder, show, done)
         services.videos.start(self._video)
-        others = differences(settings, layer_named(settings.layer, services.maker.layers).controls)
-        unlike = f"; unlike the page, it has {'; '.join(others)}" if others else ""
-        place = (
-            f"unmix-render writes it to {folder}, after those of other pages, also when this page is closed"
+        session.say(
+            "video",
+            f"unmix-render writes it to {folder}, after those of other pages, also when this page is closed",
         )
-        session.say("video", f"{place}{unlike}")
 
     def _cancel_video(self) -> None:
         if self._video is not None:

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from unmix_plugin.errors import ConfigError
+from unmix_plugin.figures.look import BACKGROUNDS
 from unmix_plugin.formats.files import eight_bits
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
@@ -23,11 +24,10 @@ from unmix_plugin.viewer.rendering.painting import layer_named
 from unmix_plugin.viewer.rendering.pictures import DEFAULT_HEIGHT, HEIGHT_BOUNDS, SUBPIXEL_BOUNDS
 from unmix_plugin.viewer.rendering.scene import Edit
 from unmix_plugin.viewer.rendering.settings import (
-    BACKGROUNDS,
     COLOUR_MAPS,
     EXPOSURE_BOUNDS,
     GAMMA_BOUNDS,
-    VIEW_TRANSFORMS,
+    HIGHLIGHTS,
     covered,
 )
 from unmix_plugin.viewer.rendering.thumbnails import Thumbnails
@@ -58,10 +58,10 @@ class LayerPanel:
             self._add_spectral(session.materials())
         self._add_menu("colour map", "colour_map", {name: name for name in COLOUR_MAPS}, "scale")
         self._add_range()
-        exposure = self._gui.add_slider("exposure (stops)", *EXPOSURE_BOUNDS, 0.1, settings.exposure_ev)
-        self._connect(exposure, "exposure_ev", "tone")
+        exposure = self._gui.add_slider("exposure (stops)", *EXPOSURE_BOUNDS, 0.1, settings.exposure)
+        self._connect(exposure, "exposure", "tone")
         self._connect(self._gui.add_slider("gamma", *GAMMA_BOUNDS, 0.05, settings.gamma), "gamma", "tone")
-        self._add_menu("highlights", "view_transform", VIEW_TRANSFORMS, "tone")
+        self._add_menu("highlights", "highlights", HIGHLIGHTS, "tone")
         self._add_menu("background", "background", {name: name for name in BACKGROUNDS})
         self._show_controls()
 

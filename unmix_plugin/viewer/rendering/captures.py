@@ -11,9 +11,9 @@ import signal
 import subprocess
 import threading
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -21,16 +21,14 @@ from jaxtyping import Float32
 
 from unmix_plugin.engine.children import child_command
 from unmix_plugin.errors import ConfigError
+from unmix_plugin.figures.look import Look
 from unmix_plugin.formats.exr import write_spectral_exr
 from unmix_plugin.formats.video import OWN_GROUP
-from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import rgb_matrix
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.model_scene import LightChoice
 from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.trained.protocol import RenderedView
-from unmix_plugin.viewer.rendering.painting import index_output
-from unmix_plugin.viewer.rendering.settings import LayerSettings, covered
 
 SIDE_BOUNDS = (16, 8192)
 """Least and greatest width and height of a picture."""
@@ -193,66 +191,37 @@ def _end(process: subprocess.Popen[str]) -> None:
             return
 
 
-def output_of(settings: LayerSettings, bands: Bands | None) -> str:
-    """The output of renders that a layer shows, by the bands that it shows (None of a scene without spectra); a
-    ConfigError where renders have no such output, or no such picture of it."""
-
-    def shown(wavelength_nm: float) -> str:
-        assert bands is not None
-        return f"{bands.centers_nm[bands.nearest(covered(bands, wavelength_nm))]:g}"
-
-    if settings.layer == "band":
-        return f"band:{shown(settings.wavelength_nm)}nm"
-    if settings.layer == "false-colour":
-        return "false-colour:" + ",".join(map(shown, settings.false_colour_nm))
-    if settings.layer == "index" and settings.index:
-        return index_output(settings.index)
-    if settings.layer in _NO_VIDEO:
-        raise ConfigError(f"videos can't show the layer {settings.layer}; choose another one")
-    return "abundances" if settings.layer == "abundance" else settings.layer
-
-
-_NO_VIDEO = ("error", "index", "diffuse", "specular")
-"""Layers that no output of a render is, or one that a video goes through band by band."""
-
-
-_UNLIKE = {
-    "abundance": "a map of each endmember, side by side",
-    "abundances": "a map of each endmember, side by side",
-    "band": "grey values from 0 to 1",
-    "pca": "the principal components of its own views",
-}
-
-
-def differences(settings: LayerSettings, controls: Collection[str]) -> list[str]:
-    """What a video has by `unmix-render` that a layer with these controls has otherwise on the page, in words."""
-    found = []
-    if settings.layer in _UNLIKE:
-        found.append(_UNLIKE[settings.layer])
-    elif "scale" in controls:
-        found.append("a colour map and a range of its own")
-    tones = (settings.exposure_ev, settings.gamma, settings.view_transform)
-    if "tone" in controls and tones != (0.0, 1.0, "srgb"):
-        found.append("no exposure, gamma or kept highlights")
-    if settings.background != "grey":
-        found.append("light grey behind it")
-    return found
-
-
 def render_argv(
     run: Path,
     cameras: Path,
     output: str,
+    look: Look,
     folder: Path,
     recipe: Path | None,
     light: LightChoice = LightChoice(),  # noqa: B008 - a frozen value
 ) -> list[str]:
-    """Arguments of `unmix-render` for a video along a camera file."""
+    """Arguments of `unmix-render` for a video along a camera file, which shows an output as a page does."""
     argv = ["--run", str(run), "--cameras", str(cameras), "--outputs", output, "--formats", "mp4"]
-    argv += ["--output", str(folder), "--overwrite"]
+    argv += ["--output", str(folder), "--overwrite", *look_argv(look)]
     if recipe is not None:
         argv += ["--edits", str(recipe)]
     if light.name is not None:
         argv += ["--environment", light.name]
     numbers = {"--environment-rotation": light.rotation_deg, "--environment-exposure": light.exposure_stops}
     return [*argv, *(f"{flag}={value:g}" for flag, value in numbers.items() if value != 0)]
+
+
+def look_argv(look: Look) -> list[str]:
+    """A look as arguments of `unmix-render`, which reads the same numbers from them."""
+    argv = []
+    for one in fields(Look):
+        value, flag = getattr(look, one.name), f"--{one.name.replace('_', '-')}"
+        if value == one.default:
+            continue
+        if one.name == "mixed":
+            argv.append(flag)
+        elif isinstance(value, tuple):
+            argv += [flag, *(np.format_float_positional(end) for end in value)]
+        else:
+            argv.append(f"{flag}={np.format_float_positional(value) if isinstance(value, float) else value}")
+    return argv

@@ -20,6 +20,7 @@ from jaxtyping import Float32, UInt8
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.figures.paint import Legend, as_bytes, background_of
 from unmix_plugin.rendering.front_to_back import composite
 from unmix_plugin.spectral.materials import Coefficients, Materials
 from unmix_plugin.trained.model_scene import EstimatedScene, ModelView
@@ -28,7 +29,7 @@ from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.trained.protocol import RenderableScene, RenderedView
 from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.rendering.aids import SceneAids
-from unmix_plugin.viewer.rendering.painting import Legend, as_bytes, layer_named, layers_of
+from unmix_plugin.viewer.rendering.painting import layer_named, layers_of, paint_layer
 from unmix_plugin.viewer.rendering.scene import Edit, SceneSource
 from unmix_plugin.viewer.rendering.settings import LayerSettings
 from unmix_plugin.viewer.view_cameras import ViewPose, camera_of
@@ -228,9 +229,6 @@ RESTING_COST = 6.0
 REFRESH_S = 2.0
 """How long one picture of a client at rest should take while training."""
 
-_TRACE_OPACITY = 0.25
-"""Opacity under which a pixel counts as empty once materials are removed."""
-
 LARGEST_FRAME_BYTES = 1 << 26
 """Coefficients that are kept for one client."""
 
@@ -314,13 +312,10 @@ class PictureMaker:
         layer = layer_named(settings.layer, self.layers)
         aids = self.aids.for_layers(frame.scene) if isinstance(frame, MaterialView) else None
         with torch.no_grad():
-            if isinstance(frame, MaterialView) and frame.scene.has_removed:
-                # Removed materials leave faint specks where they were mixed with others.
-                is_left = (frame.opacity >= _TRACE_OPACITY)[..., None]
-                frame = frame.map(lambda packed: packed * is_left)
-            picture, legend = layer.paint(frame, settings, aids)
+            painted = paint_layer(layer, frame, settings, aids)
+            picture = as_bytes(painted.over(background_of(settings))[:, :, 0])
         depth = _picture_depth(frame) if with_depth and isinstance(frame, MaterialView) else None
-        return Picture(as_bytes(picture), depth, legend, is_moving, layer.is_labels)
+        return Picture(picture, depth, painted.legend, is_moving, layer.is_labels)
 
 
 def wants_more(frame: RenderedView) -> bool:

@@ -5,26 +5,22 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, get_args
 
 import numpy as np
 
+from unmix_plugin.figures.look import BACKGROUNDS, Background, ColourMap, Highlights, Look
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.maps.indices import available_indices
 from unmix_plugin.viewer.page import choice, number, text
 
-ViewTransform = Literal["srgb", "agx"]
-VIEW_TRANSFORMS: dict[ViewTransform, str] = {
-    "srgb": "cut at white (sRGB, exact)",
-    "agx": "kept (AgX, as film does)",
+HIGHLIGHTS: dict[Highlights, str] = {
+    "cut": "cut at white (sRGB, exact)",
+    "kept": "kept (AgX, as film does)",
 }
 """Names and what users read."""
 
-BACKGROUNDS = {"grey": 0.92, "white": 1.0, "black": 0.0}
-"""sRGB value of what shows nothing; grey is that of the figures."""
-
-COLOUR_MAPS = ("viridis", "magma", "inferno", "cividis", "turbo", "coolwarm", "gray")
-"""As matplotlib names them."""
+COLOUR_MAPS: tuple[ColourMap, ...] = get_args(ColourMap)
 
 EXPOSURE_BOUNDS, GAMMA_BOUNDS = (-8.0, 8.0), (0.2, 5.0)
 _WAVELENGTH_BOUNDS = (1.0, 1e5)
@@ -34,9 +30,12 @@ _LONGEST_INDEX = 1000
 
 
 @dataclass(frozen=True)
-class LayerSettings:
-    """What is shown and how; every value lies within bounds."""
+class LayerSettings(Look):
+    """What is shown and how; every value lies within bounds. A picture is what `unmix-render` paints with this look."""
 
+    background: Background = "grey"
+    colour_map: ColourMap = "viridis"
+    mixed: bool = True
     layer: str = "rgb"
     wavelength_nm: float = 550.0
     """Shown by the layer `band`."""
@@ -46,15 +45,6 @@ class LayerSettings:
     """Shown by the layer `abundance`."""
     index: str = ""
     """Shown by the layer `index`: a name or a formula, as the output `index:` takes it; empty where none is chosen."""
-    colour_map: str = "viridis"
-    value_range: tuple[float, float] | None = None
-    """Values at the ends of the colour map; None for the layer's own."""
-    exposure_ev: float = 0.0
-    """Stops."""
-    gamma: float = 1.0
-    view_transform: ViewTransform = "srgb"
-    background: str = "grey"
-    """Where nothing is seen; one of `BACKGROUNDS`."""
 
     def changed(self, name: str, value: Any) -> LayerSettings:
         """With one setting as a browser sent it, brought within its bounds; what makes no sense changes nothing."""
@@ -66,7 +56,8 @@ def first_settings(bands: Bands) -> LayerSettings:
     centers_nm, count = bands.centers_nm.tolist(), len(bands)
     starts = (centers_nm[5 * count // 6], centers_nm[count // 2], centers_nm[count // 6])
     wavelength_nm = covered(bands, LayerSettings.wavelength_nm)
-    return LayerSettings("rgb", wavelength_nm, starts, index=next(iter(available_indices(bands)), ""))
+    index = next(iter(available_indices(bands)), "")
+    return LayerSettings(wavelength_nm=wavelength_nm, false_colour_nm=starts, index=index)
 
 
 def _checked_range(value: Any, before: tuple[float, float] | None) -> tuple[float, float] | None:
@@ -97,9 +88,9 @@ _CHECKS: dict[str, Callable[[Any, Any], Any]] = {
     ),
     "colour_map": lambda value, before: choice(value, COLOUR_MAPS, before),
     "value_range": _checked_range,
-    "exposure_ev": lambda value, before: number(value, *EXPOSURE_BOUNDS, fallback=before),
+    "exposure": lambda value, before: number(value, *EXPOSURE_BOUNDS, fallback=before),
     "gamma": lambda value, before: number(value, *GAMMA_BOUNDS, fallback=before),
-    "view_transform": lambda value, before: choice(value, VIEW_TRANSFORMS, before),
+    "highlights": lambda value, before: choice(value, HIGHLIGHTS, before),
     "background": lambda value, before: choice(value, BACKGROUNDS, before),
 }
 
