@@ -13,8 +13,7 @@ if TYPE_CHECKING:
     from unmix_plugin.scenes.scene import Scene
     from unmix_plugin.spectral.bands import Bands
     from unmix_plugin.trained.open_run import LoadedRun
-    from unmix_plugin.trained.outputs import MaterialView
-    from unmix_plugin.trained.trained_scene import TrainedScene
+    from unmix_plugin.trained.trained_scene import MaterialView, TrainedScene
 
 PURE_SHARE, MAIN_SHARE, OPAQUE = 0.9, 0.75, 0.99
 COLOURS = ("#8060a0", "#4080c0", "#b09040", "#707070")

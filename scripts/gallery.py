@@ -31,7 +31,7 @@ from unmix_plugin import Cameras, Light, MaterialView, Recipe, TrainedScene, edi
 from unmix_plugin.commands.export import export
 from unmix_plugin.editing import Operation, Remove, Rename, Replace, Retint
 from unmix_plugin.engine.geometry.camera_paths import orbit
-from unmix_plugin.engine.registry import Output
+from unmix_plugin.engine.outputs import Output
 from unmix_plugin.figures.paint import paint
 from unmix_plugin.scenes.demo.scene import make_demo_scene
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb

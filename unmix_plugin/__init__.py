@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from unmix_plugin.products.save import save as save
     from unmix_plugin.spectral.unmixing.image import unmix_image as unmix_image
     from unmix_plugin.trained.open_run import open_run as open_run
-    from unmix_plugin.trained.outputs import MaterialView as MaterialView
     from unmix_plugin.trained.protocol import Probe as Probe
+    from unmix_plugin.trained.trained_scene import MaterialView as MaterialView
     from unmix_plugin.trained.trained_scene import TrainedScene as TrainedScene
 
 # Threads that wait for each other by spinning take the time slices of those they wait for as soon as anything else
@@ -48,7 +48,7 @@ _MODULES = {
     "Cameras": "engine.geometry.cameras",
     "Comparison": "comparing.comparison",
     "Light": "editing.recipe",
-    "MaterialView": "trained.outputs",
+    "MaterialView": "trained.trained_scene",
     "Probe": "trained.protocol",
     "Recipe": "editing.recipe",
     "TrainedScene": "trained.trained_scene",

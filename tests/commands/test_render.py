@@ -34,7 +34,8 @@ def test_by_default_every_evaluation_view_is_written_in_what_suits_each_output(t
     formats |= {"rgb": ["png"], "segmentation": ["png"]}
     expected = [f"{name}/{view}.{end}" for name, ends in formats.items() for end in ends for view in views]
     expected += [f"{name}_legend.png" for name in ("abundances", "depth", "segmentation")]
-    assert files(tmp_path) == sorted([*expected, "cameras-dataset-eval.json"])
+    expected += ["segmentation_legend.csv", "cameras-dataset-eval.json"]
+    assert files(tmp_path) == sorted(expected)
     loaded = load_run(trained.run, "cpu")
     for index, view in enumerate(views):
         spectra, shares, depth = rendered(loaded, index, "spectral", "abundances", "depth")

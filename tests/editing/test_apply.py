@@ -15,7 +15,7 @@ from unmix_plugin.editing.apply import assumption_of_light
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.material_library import measured_library
-from unmix_plugin.trained.outputs import MaterialView
+from unmix_plugin.trained.trained_scene import MaterialView
 
 BANDS = Bands.of(WAVELENGTHS_NM)
 EVERY_KIND = [

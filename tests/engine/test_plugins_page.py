@@ -15,7 +15,7 @@ from tests.commands.running import done, run
 from unmix_plugin.commands.eval import evaluate
 from unmix_plugin.commands.render import render
 from unmix_plugin.commands.train import train
-from unmix_plugin.engine import Output, registry
+from unmix_plugin.engine import Output, outputs, registry
 from unmix_plugin.engine.runs.load_run import load_model
 from unmix_plugin.scenes.demo.scene import make_demo_scene
 
@@ -51,8 +51,8 @@ def test_the_example_of_the_page_imports_public_names_only_trains_and_is_evaluat
     view = loaded.model.get_outputs_for_camera(loaded.scene.eval_cameras[0])
     assert view["spectral"].shape == (16, 16, 4)
 
-    for outputs in ((), (Output("spectral", "channels", "spectra", "radiance on black"),)):
-        monkeypatch.setattr(module.SpectralGrid, "outputs", outputs, raising=False)
+    for named in ((), (Output("spectral", "channels", "spectra", "radiance on black"),)):
+        monkeypatch.setattr(module.SpectralGrid, "outputs", named, raising=False)
         done(evaluate, "--run", path, "--device", "cpu")
         metrics = json.loads((path / "eval" / "metrics.json").read_text())
         assert metrics["psnr"] > 3
@@ -75,7 +75,7 @@ def test_the_outputs_and_the_product_of_the_page_are_ones():
     assert (roughness.value_range, roughness.colour_map) == ((0.0, 1.0), "magma")
     kinds = set(re.findall(r"`(\w+)`", "".join(re.findall(r"^  \| (.*?) \|", PAGE, re.MULTILINE))))
     kinds |= set(re.findall(r"; `(\w+)`: of what is seen", PAGE))
-    assert kinds == set(get_args(registry.OutputKind))
+    assert kinds == set(get_args(outputs.OutputKind))
     [product] = [block for block in blocks if "class Grid(RunProduct)" in block]
     names = {}
     exec(compile(product, "plugins.md", "exec"), names)

@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from unmix_plugin.engine.registry import Output, OutputKind
+from unmix_plugin.engine.outputs import Output, OutputKind
 from unmix_plugin.figures.look import NEUTRAL, Look
 from unmix_plugin.figures.paint import ColourScale, colour_table, id_palette, legend_of, paint
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, srgb_to_linear

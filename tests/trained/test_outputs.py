@@ -10,14 +10,15 @@ from tests.engine.rgb_nerf_plugin import RgbNerf, RgbNerfConfig
 from tests.method_factory import CAMERA, NUM_BANDS, make_scene
 from tests.products.ball_model import RADIUS, ball_scene, cameras_around
 from tests.trained.camera_scenes import BOX, FRAME, around, record
-from unmix_plugin.engine.registry import Output
+from unmix_plugin.engine.outputs import Output
 from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.products.render.job import needs_survey, take_survey
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.features import continuum_removed, derivative_matrix
 from unmix_plugin.trained.model_scene import model_scene
-from unmix_plugin.trained.outputs import OUTPUTS, MaterialView, usual_range
+from unmix_plugin.trained.outputs import OUTPUTS, usual_range
 from unmix_plugin.trained.protocol import RenderableScene, RenderedView
+from unmix_plugin.trained.trained_scene import MaterialView
 
 SCENE = make_scene(light=[0.5, 0.7, 1.0, 0.9, 0.6])
 WITH_ARGUMENTS = (

@@ -9,9 +9,10 @@ from tests.products import ball_model
 from tests.scenes.scene_factory import cameras_of
 from unmix_plugin.products.mesh import gltf_content
 from unmix_plugin.spectral.materials import Coefficients
-from unmix_plugin.trained.outputs import OUTPUTS, MaterialView
+from unmix_plugin.trained.outputs import OUTPUTS
 from unmix_plugin.trained.surface import SurfaceAppearance, in_image, look_from_above, sample_field
 from unmix_plugin.trained.surface_mesh import TriangleMesh
+from unmix_plugin.trained.trained_scene import MaterialView
 
 SCENE = ball_model.ball_scene()
 

@@ -17,7 +17,7 @@ from tests.products.render.render_factory import read_exr
 from tests.viewer.pages import decoded, has_control, opened, serving, show_layer
 from tests.viewer.view_factory import BOX, make_source, ring, source_of_model
 from unmix_plugin.editing import Light, Recipe, Retint
-from unmix_plugin.engine.registry import Output
+from unmix_plugin.engine.outputs import Output
 from unmix_plugin.engine.runs.load_run import SceneRecord
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.engine.training.training_control import DeviceLock
@@ -33,6 +33,7 @@ from unmix_plugin.trained.measured_surface import MeasuredSurface
 from unmix_plugin.trained.measures import Scale, keep_region, keep_scale, read_measures
 from unmix_plugin.trained.model_scene import ModelScene
 from unmix_plugin.trained.regions import Box, InView
+from unmix_plugin.trained.run_materials import endmember_colours
 from unmix_plugin.trained.run_views import recorded_views, world_frame
 from unmix_plugin.viewer.panels.materials import likeness_rows
 from unmix_plugin.viewer.rendering.scene import Edit, SceneSource
@@ -75,7 +76,7 @@ def test_an_index_is_chosen_by_name_or_typed_as_a_formula_and_a_wrong_one_says_w
     page.wait_for_text("redness index of soils")
     page.set("formula", " r650/r450 ")
     page.wait_for_text("formula r650/r450")
-    assert "of radiance: light unknown" in page.texts
+    assert "of radiance, since the scene" in page.texts
     for wrong, said in (
         ("r650/(r450", "can't be read here"),
         ("r650/r900", "needs 900 nm"),
@@ -135,7 +136,8 @@ def test_the_point_cloud_follows_the_light_and_shows_no_hidden_material(viewer, 
     maker = viewer.services.maker
     scene = maker.edited(Edit())
     materials = scene.materials
-    linear = maker.aids.for_layers(scene).reference_spectra(materials) @ rgb_matrix(materials.bands)
+    rays = maker.aids.for_layers(scene).reference
+    linear = materials.spectra(rays) / rays.accumulation[:, None] @ rgb_matrix(materials.bands)
     assert np.array_equal(colours, eight_bits(linear_to_srgb(linear.clamp(0, 1)).numpy()))
     assert np.array_equal(points, same)
     assert relit[:, 2].mean() < colours[:, 2].mean() - 5

@@ -22,8 +22,7 @@ from unmix_plugin.figures.paint import Legend, background_of
 from unmix_plugin.model import UnmixModel
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.trained.open_run import unmix_scene
-from unmix_plugin.trained.outputs import MaterialView
-from unmix_plugin.trained.trained_scene import TrainedScene, reference_rays
+from unmix_plugin.trained.trained_scene import MaterialView, TrainedScene, reference_rays
 from unmix_plugin.viewer.rendering import painting
 from unmix_plugin.viewer.rendering.aids import LayerAids
 from unmix_plugin.viewer.rendering.painting import LAYERS, layer_named

@@ -205,14 +205,12 @@ _UNITS = {"psnr": " dB", "sam": " rad", "angle": " rad", "seconds": " s"}
 def _materials_scene(loaded: LoadedPipeline, is_edited: bool) -> TrainedScene | None:
     """The scene of mixed materials that the run's method makes; None where its model measures its images itself."""
     from unmix_plugin.commands.reporting import spectral_scene
-    from unmix_plugin.engine.registry import find_method
-    from unmix_plugin.trained.open_run import require_materials
-    from unmix_plugin.trained.trained_scene import TrainedScene
+    from unmix_plugin.trained.open_run import mixture_scene, require_materials
 
-    name = loaded.config.method_name
-    make, has_spectra = find_method(name).scene, spectral_scene(loaded.pipeline.datamanager) is not None
-    scene = None if make is None or not has_spectra else make(loaded.pipeline.model, loaded.scene, None)
-    return require_materials(scene, name) if is_edited or isinstance(scene, TrainedScene) else None
+    name, scene = loaded.config.method_name, None
+    if spectral_scene(loaded.pipeline.datamanager) is not None:
+        scene = mixture_scene(loaded.pipeline.model, name, loaded.scene)
+    return require_materials(scene, name) if is_edited else scene
 
 
 if __name__ == "__main__":  # of one of several processes

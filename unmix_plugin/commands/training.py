@@ -199,15 +199,14 @@ def _compare_views(trainer: Trainer, scene: Scene, console: Console) -> None:
     from unmix_plugin.commands.reporting import say, working
     from unmix_plugin.engine.runs.load_run import read_scene_record
     from unmix_plugin.engine.training.progress import write_event
-    from unmix_plugin.trained.open_run import snapshot
-    from unmix_plugin.trained.trained_scene import TrainedScene
+    from unmix_plugin.trained.open_run import mixture_scene
     from unmix_plugin.trained.view_fit import describe_misfits, fit_views, write_fits
 
     averages = None if trainer.average is None else trainer.average.values
     with trainer.control.device.training_turn(), working(console, "comparing training views"):
         record = read_scene_record(trainer.run)
-        trained = snapshot(trainer.pipeline.model, trainer.config.method_name, record, averages)
-        if not isinstance(trained, TrainedScene):
+        trained = mixture_scene(trainer.pipeline.model, trainer.config.method_name, record, averages)
+        if trained is None:
             return
         found = write_fits(trainer.run.path, fit_views(trained, scene))
     for remark in describe_misfits(found):

@@ -15,14 +15,15 @@ from scipy.spatial import KDTree
 
 from unmix_plugin.comparing.comparison import Comparison
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.figures.pictures import ColourScale, Picture, TitledPicture, over_neutral, paint
+from unmix_plugin.engine.outputs import Output
+from unmix_plugin.figures.paint import ColourScale, paint, scale_strip
+from unmix_plugin.figures.pictures import Picture, TitledPicture
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import colour_mode
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION
 from unmix_plugin.trained.evaluation import picture
-from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.trained.run_views import RunView
-from unmix_plugin.trained.trained_scene import TrainedScene
+from unmix_plugin.trained.trained_scene import MaterialView, TrainedScene
 
 _SAME_PLACE_PX = 2.5
 """How far from a vertex a ray may end and still show what is known of it."""
@@ -120,7 +121,9 @@ class ChangeMap:
         """Its colours on a view, faint where it is not significant, neutral where nothing is known."""
         values, p = view.of_pixels(self.values), view.of_pixels(self.p)
         opacity = np.where(np.isfinite(values), np.where(p <= level, 1.0, _FAINT), 0.0)
-        return over_neutral(paint(values, self.scale), opacity)
+        ends = (self.scale.low, self.scale.high)
+        output = Output(self.name, "map", self.title, self.scale.label, ends, self.scale.colour_map)
+        return paint(output, values, opacity).picture()
 
 
 def change_maps(comparison: Comparison) -> list[ChangeMap]:
@@ -195,5 +198,4 @@ def panels(view: ShownView, comparison: Comparison, maps: Sequence[ChangeMap]) -
 
 def strip(scale: ColourScale) -> Picture:
     """The colours of a scale from left to right."""
-    values = np.linspace(scale.low, scale.high, 160)[None].repeat(10, axis=0)
-    return paint(values, scale)
+    return scale_strip(scale, 160, 10)

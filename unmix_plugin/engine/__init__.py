@@ -31,12 +31,12 @@ if TYPE_CHECKING:
     from unmix_plugin.engine.model import Model as Model
     from unmix_plugin.engine.model import TrainingCallback as TrainingCallback
     from unmix_plugin.engine.model import TrainingCallbackLocation as TrainingCallbackLocation
+    from unmix_plugin.engine.outputs import Output as Output
+    from unmix_plugin.engine.outputs import named_output as named_output
     from unmix_plugin.engine.pipeline import Pipeline as Pipeline
     from unmix_plugin.engine.registry import MethodSpecification as MethodSpecification
-    from unmix_plugin.engine.registry import Output as Output
     from unmix_plugin.engine.registry import discover_methods as discover_methods
     from unmix_plugin.engine.registry import find_method as find_method
-    from unmix_plugin.engine.registry import named_output as named_output
     from unmix_plugin.engine.runs.config_json import config_from_json as config_from_json
     from unmix_plugin.engine.runs.load_run import LoadedModel as LoadedModel
     from unmix_plugin.engine.runs.load_run import load_config as load_config
@@ -64,7 +64,8 @@ _MODULES = {
     "machine": ("step_generator",),
     "model": ("DataManager", "Field", "Model", "TrainingCallback", "TrainingCallbackLocation"),
     "pipeline": ("Pipeline",),
-    "registry": ("MethodSpecification", "Output", "discover_methods", "find_method", "named_output"),
+    "outputs": ("Output", "named_output"),
+    "registry": ("MethodSpecification", "discover_methods", "find_method"),
     "runs.config_json": ("config_from_json",),
     "runs.load_run": ("LoadedModel", "load_config", "load_model", "load_pipeline"),
     "runs.scene_record": ("SceneRecord",),

@@ -22,8 +22,8 @@ from unmix_plugin.engine.configs import DataManagerConfig, ModelConfig
 from unmix_plugin.engine.decisions import Decision
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
+from unmix_plugin.engine.outputs import Output
 from unmix_plugin.engine.processes import ALONE, Processes
-from unmix_plugin.engine.registry import Output
 from unmix_plugin.errors import ConfigError
 
 

@@ -1,19 +1,39 @@
-"""Methods: what a package registers for one, what it can show, and finding ours and any third party's."""
+"""Methods: what a package registers for one, and finding ours and any third party's."""
 
 from __future__ import annotations
 
 import traceback
-from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol
 
 from unmix_plugin.engine.configs import TrainerConfig, place_of
 from unmix_plugin.errors import ConfigError, did_you_mean
 
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from unmix_plugin.engine.model import Model
+    from unmix_plugin.engine.outputs import Output
+    from unmix_plugin.engine.runs.scene_record import SceneRecord
+
 METHOD_GROUP = "unmix_plugin.method_configs"
 """Entry-point group; each entry names a `MethodSpecification`."""
+
+
+class ShownScene(Protocol):
+    """What the engine knows of a trained scene: `trained.protocol.RenderableScene` is all of it."""
+
+    @property
+    def outputs(self) -> tuple[Output, ...]:
+        """All outputs that take no argument."""
+        ...
+
+
+SceneMaker = Callable[["Model", "SceneRecord", "Mapping[str, Tensor] | None"], ShownScene]
+"""From a model, the record of its scene and averaged parameters (None: the model's own) to its trained scene."""
 
 
 class MethodSpecification:
@@ -23,7 +43,7 @@ class MethodSpecification:
         self,
         config: TrainerConfig | Callable[[], TrainerConfig],
         description: str,
-        scene: Callable[..., Any] | None = None,
+        scene: SceneMaker | None = None,
         products: Callable[[], Sequence[Any]] | None = None,
         name: str | None = None,
     ) -> None:
@@ -32,8 +52,8 @@ class MethodSpecification:
             config: Defaults of everything, or what makes them when they are first asked for: settings may take seconds
                 to import.
             description: One line for the list of methods.
-            scene: From a model, the record of its scene and averaged parameters (None: the model's own) to what
-                commands and the viewer show, as `trained.protocol.RenderableScene`; None: the model's `outputs`.
+            scene: Makes what commands and the viewer show, a `trained.protocol.RenderableScene`; None: the model's
+                `outputs`.
             products: What `unmix-export` can make of this method's runs and of no other's, as
                 `products.product.RunProduct` with defaults; called when the command is. None: nothing of its own.
             name: On the command line, as `config.method_name`; needed where `config` is made later.
@@ -124,101 +144,3 @@ def _load(entry_point: EntryPoint) -> MethodSpecification | BrokenPlugin:
             entry_point.name, f"{entry_point.value} is a {type(found).__name__}, not a MethodSpecification"
         )
     return found
-
-
-OutputKind = Literal[
-    "channels", "spectra", "shares", "srgb", "linear", "picture", "grey", "map", "labels", "vectors"
-]
-"""What an output's numbers are, (height, width, ...): any channels, on black; a number a band of what is seen, NaN
-where nothing is; a share or score of each class; sRGB on
-black (3); linear light on black (3); a picture not multiplied by opacity (3); one channel of light on black; any other
-number a pixel; uint8 ids, 255 where nothing is; unit vectors (3)."""
-
-
-WORLD_UNITS, METRES = "world units", "metres"
-"""Units of outputs that are lengths; maps in metres turn the one into the other."""
-
-
-@dataclass(frozen=True)
-class Output:
-    """One thing that can be shown of a trained scene. What programs ask of it is a field; sentences are printed."""
-
-    name: str
-    """In commands, files and the viewer."""
-    kind: OutputKind
-    title: str
-    """What a menu says."""
-    label: str
-    """What its numbers are, without their unit, as a colour bar says it."""
-    value_range: tuple[float, float] | None = None
-    """Values at the ends of a colour map; None where only the views tell."""
-    colour_map: str = "viridis"
-    """As matplotlib names it."""
-    classes: tuple[tuple[str, tuple[float, ...]], ...] = ()
-    """Of labels and shares: names of the ids from 0, or of the channels, and their sRGB colours; empty where they have
-    none of their own."""
-    unit: str = field(default="", kw_only=True)
-    """Of its numbers; `WORLD_UNITS` of lengths, which maps with a scale have in metres."""
-    quantity: Literal["radiance", "reflectance"] | None = field(default=None, kw_only=True)
-    """What spectra are, as OpenEXR and ENVI files say it."""
-    centers_nm: tuple[float, ...] = field(default=(), kw_only=True)
-    """Centre of the band that each channel is; empty where channels are not single bands, or those of the scene."""
-    is_on_black: bool = field(default=False, kw_only=True)
-    """Whether it is light seen before black, which pictures say otherwise."""
-    is_premultiplied: bool = field(default=False, kw_only=True)
-    """Whether its numbers are multiplied by the opacity, as light is anyway: pictures show them as of what is seen."""
-    legend: str = field(default="", kw_only=True)
-    """What the colours of pictures mean, for people; empty: what the numbers are."""
-    nothing: int | None = field(default=None, kw_only=True)
-    """The number of pixels in which nothing is, where only that tells them; means of other programs leave it out."""
-    remarks: tuple[str, ...] = field(default=(), kw_only=True)
-    """What else is to be known of the numbers, for people."""
-
-    @property
-    def label_with_unit(self) -> str:
-        """What its numbers are."""
-        return f"{self.label} in {self.unit}" if self.unit else self.label
-
-    @property
-    def what(self) -> str:
-        """What its numbers are, in one line for people."""
-        return self.described(" on black")
-
-    def described(self, behind: str) -> str:
-        """The same of a picture with something else behind than black."""
-        return with_remarks(f"{self.label_with_unit}{behind if self.is_on_black else ''}", self.remarks)
-
-
-def with_remarks(label: str, remarks: Sequence[str]) -> str:
-    """A line for people.
-
-    >>> with_remarks("radiance", ("1 = full scale", "false colour"))
-    'radiance, 1 = full scale; false colour'
-    """
-    return "; ".join([", ".join([label, *remarks[:1]]), *remarks[1:]])
-
-
-AnyOutput = TypeVar("AnyOutput", bound=Output)
-
-
-def named_output(outputs: Iterable[AnyOutput], name: str) -> AnyOutput:
-    """The output of that name.
-
-    Raises:
-        ConfigError: there is none.
-    """
-    named = {output.name: output for output in outputs}
-    if name in named:
-        return named[name]
-    raise no_output(name, named, named)
-
-
-def no_output(name: str, similar: Iterable[str], known: Collection[str]) -> ConfigError:
-    """The error that there is no output of that name; an argument after a colon is not part of what is looked for.
-
-    Args:
-        similar: Names of which some may have been meant.
-        known: What the message lists.
-    """
-    hint = did_you_mean(name.partition(":")[0], similar, likeness=0.5, form=" ({})")
-    return ConfigError(f"there is no output named {name!r}{hint}; known are {', '.join(known)}")

@@ -20,7 +20,7 @@ import torch
 from jaxtyping import Float, Float64, UInt8
 from torch import Tensor
 
-from unmix_plugin.engine.registry import Output
+from unmix_plugin.engine.outputs import Output
 from unmix_plugin.figures.look import BACKGROUNDS, NEUTRAL, Look
 from unmix_plugin.figures.plotting import Colour, id_colours
 from unmix_plugin.spectral.colour.conversion import agx, linear_to_srgb, srgb_to_linear
@@ -201,6 +201,12 @@ def colour_table(colour_map: str) -> Float64[np.ndarray, "256 3"]:
     from matplotlib import colormaps
 
     return colormaps[colour_map](np.arange(256))[:, :3]
+
+
+def scale_strip(scale: ColourScale, width: int, height: int) -> Float64[np.ndarray, "H W 3"]:
+    """The colours of a scale from left to right, sRGB."""
+    levels = np.linspace(0, 255, width).round().astype(int)
+    return np.repeat(colour_table(scale.colour_map)[levels][None], height, axis=0)
 
 
 def _mapped(values: Float64[Tensor, "H W T"], scale: ColourScale) -> Float64[Tensor, "H W T 3"]:

@@ -22,9 +22,9 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from unmix_plugin.engine.outputs import Output
 from unmix_plugin.engine.pipeline import Pipeline, average_metrics
 from unmix_plugin.engine.processes import Processes
-from unmix_plugin.engine.registry import Output
 from unmix_plugin.figures.look import NEUTRAL
 from unmix_plugin.figures.paint import paint, scale_of
 from unmix_plugin.figures.pictures import Picture, TitledPicture, draw_panels, in_rows

@@ -21,9 +21,8 @@ if TYPE_CHECKING:
     from unmix_plugin.spectral.materials import Materials
     from unmix_plugin.trained.evaluation import PredictedView
     from unmix_plugin.trained.open_run import LoadedRun
-    from unmix_plugin.trained.outputs import MaterialView
     from unmix_plugin.trained.run_views import RunView, ViewChoice
-    from unmix_plugin.trained.trained_scene import TrainedScene
+    from unmix_plugin.trained.trained_scene import MaterialView, TrainedScene
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ The name of a product follows from that of its class. Help needs nothing else: i
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Literal
 
@@ -185,9 +186,7 @@ class Scale(RunWork):
 
     def write(self, job: Job) -> list[Path]:
         """Find the points, set the scale."""
-        from unmix_plugin.products.regions import set_scale
-
-        return set_scale(job, self)
+        return import_module("unmix_plugin.products.regions").set_scale(job, self)
 
 
 @dataclass(frozen=True)

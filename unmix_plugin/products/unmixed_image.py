@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from jaxtyping import Float64, Int
 
-from unmix_plugin.engine.registry import Output
+from unmix_plugin.engine.outputs import Output
 from unmix_plugin.figures.paint import paint, scale_of
 from unmix_plugin.figures.pictures import Picture, TitledPicture, draw_panels, in_rows
 from unmix_plugin.figures.plotting import distinct_colours, own_colours

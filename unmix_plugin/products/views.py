@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from unmix_plugin.engine.registry import Output
+from unmix_plugin.engine.outputs import Output
 from unmix_plugin.figures.look import NEUTRAL
 from unmix_plugin.figures.paint import paint, scale_of
 from unmix_plugin.figures.pictures import Picture, TitledPicture, draw_panels, in_rows
@@ -28,8 +28,8 @@ from unmix_plugin.spectral.colour.conversion import colour_mode
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.spectral.segmentation import NOTHING_ID
 from unmix_plugin.trained.evaluation import PredictedView, picture, predicted_view
-from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.trained.run_materials import endmember_colours
+from unmix_plugin.trained.trained_scene import MaterialView
 
 SHARE = Output("abundance", "map", "abundance", "abundance", (0.0, 1.0))
 """A material's part of what is seen, in the same colours in every figure."""

@@ -35,8 +35,7 @@ from unmix_plugin.rendering.front_to_back import composite
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.sensors.views import smooth_terms
 from unmix_plugin.trained.evaluation import PredictedView, ViewTruth, render_view, subpixels_for
-from unmix_plugin.trained.outputs import MaterialView
-from unmix_plugin.trained.trained_scene import TrainedScene
+from unmix_plugin.trained.trained_scene import MaterialView, TrainedScene
 
 _NUM_STEPS = 20
 

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.registry import Output
+from unmix_plugin.engine.outputs import Output
 from unmix_plugin.errors import RunError
 from unmix_plugin.figures.paint import paint
 from unmix_plugin.figures.pictures import Picture
@@ -43,8 +43,7 @@ from unmix_plugin.spectral.segmentation import NOTHING_ID, SegmentationScores, S
 from unmix_plugin.spectral.sensor import SceneSensor
 
 if TYPE_CHECKING:
-    from unmix_plugin.trained.outputs import MaterialView
-    from unmix_plugin.trained.trained_scene import TrainedScene
+    from unmix_plugin.trained.trained_scene import MaterialView, TrainedScene
 
 
 _MOST_SENSOR_SUBPIXELS = 4

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.engine.model import Model
-from unmix_plugin.engine.registry import Output, named_output
+from unmix_plugin.engine.outputs import Output, named_output
 from unmix_plugin.engine.runs.load_run import SceneRecord
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.scenes.scene import Normalisation
@@ -188,6 +188,11 @@ class EstimatedScene(RenderableScene, Protocol):
     def estimate(self, camera: Cameras, subpixels: int, number: int) -> ModelView:
         """A view with few samples; those of other numbers, from 0, are independent of it."""
         ...
+
+
+def lights_of(scene: RenderableScene) -> tuple[str, ...]:
+    """Names of the lights that a scene can be shown in beside files of environments; none where its light is fixed."""
+    return scene.lights if isinstance(scene, RelightableScene) else ()
 
 
 def relit(scene: RenderableScene, choice: LightChoice, method_name: str) -> RelightableScene:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -74,7 +74,8 @@ def snapshot(
     model: Model, method_name: str, record: SceneRecord, averages: Mapping[str, Tensor] | None = None
 ) -> RenderableScene:
     """The scene of a model of any method, as its registration makes it."""
-    return (find_method(method_name).scene or model_scene)(model, record, averages)
+    make = find_method(method_name).scene or model_scene
+    return cast(RenderableScene, make(model, record, averages))
 
 
 def find_scene(summary: Mapping[str, Any], run: Path, data: Path | None) -> Scene | None:
@@ -178,6 +179,16 @@ def open_measured(path: str | Path, data: str | Path | None = None) -> MeasuredS
         place = record.summary.get("root")
         raise SceneError(f"no scene, or no longer the same, at {place}; say where it is now")
     return MeasuredScene(scene, record.summary.get("illuminant"))
+
+
+def mixture_scene(
+    model: Model, method_name: str, record: SceneRecord, averages: Mapping[str, Tensor] | None = None
+) -> TrainedScene | None:
+    """The scene of mixed materials that a method makes; None of a method that makes none."""
+    if find_method(method_name).scene is None:  # shown by its own outputs, if it names some
+        return None
+    scene = snapshot(model, method_name, record, averages)
+    return scene if isinstance(scene, TrainedScene) else None
 
 
 def require_materials(scene: RenderableScene | None, method_name: str) -> TrainedScene:

@@ -1,4 +1,4 @@
-"""A rendered view of a scene of mixed materials, and the table of everything that can be shown of it.
+"""The table of everything that can be shown of a scene of mixed materials, and what pictures of it are painted from.
 
 Notation: `H x W` pixels, `B` bands, `K` endmembers.
 """
@@ -6,18 +6,18 @@ Notation: `H x W` pixels, `B` bands, `K` endmembers.
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.registry import WORLD_UNITS, Output, OutputKind, no_output
+from unmix_plugin.engine.outputs import WORLD_UNITS, Output, OutputKind, no_output
 from unmix_plugin.errors import ConfigError, SpectrumError, did_you_mean
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import (
@@ -35,78 +35,62 @@ from unmix_plugin.trained.protocol import RenderedView
 from unmix_plugin.trained.reflectance_maps import ReflectanceMap, Score, parse_reflectance_map
 from unmix_plugin.trained.run_materials import endmember_colours
 
-if TYPE_CHECKING:
-    from unmix_plugin.trained.trained_scene import TrainedScene
 
+class MixtureView(ABC):
+    """What outputs of mixed materials are computed from: a view of one camera, (H, W, ...)."""
 
-@dataclass(frozen=True)
-class MaterialView:
-    """What one camera sees of a scene."""
-
-    scene: TrainedScene
-    """With the materials to show; the coefficients may be rendered with others on the same shapes."""
-    camera: Cameras
     coefficients: Coefficients
-    """(H, W, ...)."""
 
     @property
+    @abstractmethod
     def materials(self) -> Materials:
         """The spectra that the coefficients are multiplied with."""
-        return self.scene.materials
 
     @property
-    def opacity(self) -> Float[Tensor, "H W"]:
+    @abstractmethod
+    def opacity(self) -> Tensor:
         """[0, 1]."""
-        return self.coefficients.accumulation
 
     @property
-    def coverage(self) -> Float[Tensor, "H W"]:
-        """How much of a pixel shows something, [0, 1]: a sky or a backdrop is behind all."""
-        return torch.ones_like(self.opacity) if self.scene.field.has_sky else self.opacity
+    @abstractmethod
+    def coverage(self) -> Tensor:
+        """How much of a pixel shows something, [0, 1]."""
 
     @property
-    def spectra(self) -> Float[Tensor, "H W B"]:
+    @abstractmethod
+    def spectra(self) -> Tensor:
         """Radiance on black."""
-        return self.materials.spectra(self.coefficients)
 
     @property
-    def ray_distance(self) -> Float[Tensor, "H W"]:
+    @abstractmethod
+    def ray_distance(self) -> Tensor:
         """Along the ray, world units; 0 where nothing is."""
-        return self.coefficients.ray_distance / self.scene.frame.scale
 
     @property
-    def depth(self) -> Float[Tensor, "H W"]:
+    @abstractmethod
+    def depth(self) -> Tensor:
         """Along the viewing axis, world units; 0 where nothing is."""
-        camera = self.camera.to(self.coefficients.packed.device)
-        rays = camera.image_rays(0)
-        assert rays.axes is not None
-        along_axis = (rays.directions * rays.axes).sum(dim=-1)
-        return self.ray_distance * along_axis.view_as(self.opacity)
 
     @property
-    def normals(self) -> Float[Tensor, "H W 3"]:
+    @abstractmethod
+    def normals(self) -> Tensor:
         """Unit vectors in world axes; 0 where nothing is."""
-        scene, seen = self.scene, self.coefficients
-        rays = self.camera.to(scene.device).image_rays(0)
-        normals = scene.renderer.normals(scene.field, rays, seen.ray_distance.flatten())
-        turned = normals @ torch.as_tensor(scene.frame.rotation, dtype=normals.dtype).to(normals)
-        return turned.view(*seen.accumulation.shape, 3) * seen.is_occupied[..., None]
 
-    def map(self, function: Callable[[Tensor], Tensor]) -> MaterialView:
+    @property
+    @abstractmethod
+    def has_removed(self) -> bool:
+        """Whether the scene is shown without some of its materials."""
+
+    @abstractmethod
+    def map(self, function: Callable[[Tensor], Tensor]) -> MixtureView:
         """The same view with its coefficients on another device, or of some rows."""
-        return MaterialView(self.scene, self.camera, self.coefficients.map(function))
-
-    @torch.no_grad()
-    def __getitem__(self, name: str) -> Tensor:
-        """An output by its name, as `find_output` takes it."""
-        return self.scene.output(name).compute(self)
 
 
 Capability: TypeAlias = Literal["light"]
 """What a scene may lack that an output needs: a known light."""
 
 
-_Compute: TypeAlias = Callable[[MaterialView], Tensor]
+_Compute: TypeAlias = Callable[[MixtureView], Tensor]
 """From a rendered view to (H, W, ...)."""
 
 _LEAST_SEEN = 1e-3
@@ -117,12 +101,12 @@ _LEAST_SEEN = 1e-3
 class MaterialOutput(Output):
     """An output of a scene of mixed materials, with its function."""
 
-    compute: Callable[[MaterialView], Tensor] = field(kw_only=True)
+    compute: Callable[[MixtureView], Tensor] = field(kw_only=True)
     """From a rendered view to (H, W, ...)."""
     needs: frozenset[Capability] = field(default=frozenset(), kw_only=True)
     fewest_bands: int = field(default=1, kw_only=True)
     """With light, that it takes."""
-    light: Callable[[MaterialView], Tensor] | None = field(default=None, kw_only=True)
+    light: Callable[[MixtureView], Tensor] | None = field(default=None, kw_only=True)
     """Of outputs that are cut at white: the linear light before that, which pictures are painted from."""
     score: ReflectanceMap | None = field(default=None, kw_only=True)
     """Of outputs that are made of reflectance."""
@@ -162,7 +146,7 @@ class PictureValues:
 @torch.no_grad()
 def values_of(view: RenderedView, output: Output) -> Tensor:
     """The numbers of an output of a view, (H, W, ...)."""
-    if isinstance(view, MaterialView) and isinstance(output, MaterialOutput):
+    if isinstance(output, MaterialOutput) and isinstance(view, MixtureView):
         return output.compute(view)
     return view[output.name]
 
@@ -175,17 +159,18 @@ mixed with others."""
 @torch.no_grad()
 def picture_values(view: RenderedView, output: Output) -> PictureValues:
     """What a picture of an output is painted from: its numbers, or the light before it is cut at white."""
-    if not isinstance(view, MaterialView) or not isinstance(output, MaterialOutput):
-        return _filled(view, output, values_of(view, output))
-    if view.scene.has_removed:
-        is_there = (view.opacity >= _TRACE_OPACITY)[..., None]
-        view = view.map(lambda packed: packed * is_there)
+    if not isinstance(output, MaterialOutput) or not isinstance(view, MixtureView):
+        return _filled(view, output, view[output.name])
+    mixture: MixtureView = view
+    if mixture.has_removed:
+        is_there = (mixture.opacity >= _TRACE_OPACITY)[..., None]
+        mixture = mixture.map(lambda packed: packed * is_there)
     if output.light is not None:
-        return _filled(view, replace(output, kind="linear"), output.light(view))
-    return _filled(view, output, output.compute(view))
+        return _filled(mixture, replace(output, kind="linear"), output.light(mixture))
+    return _filled(mixture, output, output.compute(mixture))
 
 
-def _filled(view: RenderedView, output: Output, values: Tensor) -> PictureValues:
+def _filled(view: RenderedView | MixtureView, output: Output, values: Tensor) -> PictureValues:
     if output.name == "accumulation":  # opacity itself is shown everywhere, also where there is little of it
         return PictureValues(output, values, torch.ones_like(view.opacity))
     is_light = output.kind in ("srgb", "linear", "grey", "channels")
@@ -199,7 +184,7 @@ def _light(matrix: Callable[[Bands], Tensor], *, diffuse: bool = True, specular:
     )
 
 
-def _components(view: MaterialView, colours: PcaColours) -> Tensor:
+def _components(view: MixtureView, colours: PcaColours) -> Tensor:
     """Principal components of what is seen, stretched to [0, 1]; 0 where nothing is."""
     opacity = view.opacity[..., None]
     seen = view.materials.through(view.coefficients, colours.axes) / opacity.clamp(min=_LEAST_SEEN)
@@ -213,19 +198,19 @@ def components_of(materials: Materials, seen: Coefficients) -> PcaColours:
     return PcaColours.fit(materials.spectra(seen) / seen.accumulation[..., None])
 
 
-def _pca(view: MaterialView) -> Tensor:
+def _pca(view: MixtureView) -> Tensor:
     seen = view.coefficients.flatten()
     return _components(view, components_of(view.materials, seen.map(lambda packed: packed[seen.is_occupied])))
 
 
-def _reflectance(view: MaterialView) -> Tensor:
+def _reflectance(view: MixtureView) -> Tensor:
     return view.materials.reflectance(view.coefficients)
 
 
-def _of_lit_bands(function: Callable[[Tensor, np.ndarray], Tensor]) -> Callable[[MaterialView], Tensor]:
+def _of_lit_bands(function: Callable[[Tensor, np.ndarray], Tensor]) -> Callable[[MixtureView], Tensor]:
     """A function of reflectances and their wavelengths, over the bands with light; NaN in the others."""
 
-    def compute(view: MaterialView) -> Tensor:
+    def compute(view: MixtureView) -> Tensor:
         reflectance, lit = _reflectance(view), view.materials.is_lit.cpu()
         found = torch.full_like(reflectance, torch.nan)
         centers_nm = view.materials.bands.centers_nm[lit.numpy()]
@@ -235,7 +220,7 @@ def _of_lit_bands(function: Callable[[Tensor, np.ndarray], Tensor]) -> Callable[
     return compute
 
 
-def _derivative(order: Literal[1, 2]) -> Callable[[MaterialView], Tensor]:
+def _derivative(order: Literal[1, 2]) -> Callable[[MixtureView], Tensor]:
     def derivative(reflectance: Tensor, wavelengths_nm: np.ndarray) -> Tensor:
         matrix = torch.from_numpy(derivative_matrix(wavelengths_nm, order))
         return reflectance.double() @ matrix.to(reflectance.device)
@@ -243,7 +228,7 @@ def _derivative(order: Literal[1, 2]) -> Callable[[MaterialView], Tensor]:
     return _of_lit_bands(derivative)
 
 
-def _scores(view: MaterialView) -> Tensor:
+def _scores(view: MixtureView) -> Tensor:
     return material_scores(view.spectra, view.materials.endmembers)
 
 
@@ -535,7 +520,7 @@ def _reflectance_map(name: str, _: str, materials: Materials) -> MaterialOutput:
     asked = parse_reflectance_map(name, materials.bands, materials.is_lit)
     undefined = ("NaN where undefined",) if asked.kind == "map" else ()
 
-    def compute(view: MaterialView) -> Tensor:
+    def compute(view: MixtureView) -> Tensor:
         if asked.is_local:
             return _scored(view, asked.fit(torch.empty(0, len(view.materials.bands))))
         reflectance = view.materials.reflectance(view.coefficients)
@@ -559,7 +544,7 @@ _CHUNK = 1 << 16
 """Pixels whose spectra are held at once."""
 
 
-def _scored(view: MaterialView, score: Score) -> Tensor:
+def _scored(view: MixtureView, score: Score) -> Tensor:
     """Numbers made of reflectance, chunk by chunk: the spectra of a whole picture may not fit into memory."""
     rows = view.coefficients.flatten()
     chunks = [rows.map(lambda _, part=part: part) for part in rows.packed.split(_CHUNK)]

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import SceneBox
-from unmix_plugin.engine.registry import Output
+from unmix_plugin.engine.outputs import Output
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.materials import Materials

@@ -20,7 +20,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from unmix_plugin.engine.registry import OutputKind, with_remarks
+from unmix_plugin.engine.outputs import OutputKind, with_remarks
 from unmix_plugin.errors import ConfigError, SpectrumError, counted
 from unmix_plugin.figures.plotting import distinct_colours, own_colours
 from unmix_plugin.formats.libraries import library_of, read_library

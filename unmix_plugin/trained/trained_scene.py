@@ -20,7 +20,7 @@ from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
-from unmix_plugin.engine.registry import Output
+from unmix_plugin.engine.outputs import Output
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.field import CoefficientField
 from unmix_plugin.rendering.front_to_back import composite_view
@@ -31,7 +31,7 @@ from unmix_plugin.spectral.materials import Coefficients, Materials
 from unmix_plugin.trained.measures import Scale
 from unmix_plugin.trained.outputs import (
     MaterialOutput,
-    MaterialView,
+    MixtureView,
     available_outputs,
     components_of,
     find_output,
@@ -48,6 +48,79 @@ def one_pixel(camera: Cameras, column: int, row: int) -> Cameras:
             f"columns are 0 to {camera.width - 1}, rows 0 to {camera.height - 1}"
         )
     return camera.crop(column, row, 1, 1)
+
+
+@dataclass(frozen=True)
+class MaterialView(MixtureView):
+    """What one camera sees of a scene."""
+
+    scene: TrainedScene
+    """With the materials to show; the coefficients may be rendered with others on the same shapes."""
+    camera: Cameras
+    coefficients: Coefficients
+    """(H, W, ...)."""
+
+    @property
+    def materials(self) -> Materials:
+        """The spectra that the coefficients are multiplied with."""
+        return self.scene.materials
+
+    @property
+    def opacity(self) -> Float[Tensor, "H W"]:
+        """[0, 1]."""
+        return self.coefficients.accumulation
+
+    @property
+    def coverage(self) -> Float[Tensor, "H W"]:
+        """How much of a pixel shows something, [0, 1]: a sky or a backdrop is behind all."""
+        return torch.ones_like(self.opacity) if self.scene.field.has_sky else self.opacity
+
+    @property
+    def spectra(self) -> Float[Tensor, "H W B"]:
+        """Radiance on black."""
+        return self.materials.spectra(self.coefficients)
+
+    @property
+    def ray_distance(self) -> Float[Tensor, "H W"]:
+        """Along the ray, world units; 0 where nothing is."""
+        return self.coefficients.ray_distance / self.scene.frame.scale
+
+    @property
+    def depth(self) -> Float[Tensor, "H W"]:
+        """Along the viewing axis, world units; 0 where nothing is."""
+        camera = self.camera.to(self.coefficients.packed.device)
+        rays = camera.image_rays(0)
+        assert rays.axes is not None
+        along_axis = (rays.directions * rays.axes).sum(dim=-1)
+        return self.ray_distance * along_axis.view_as(self.opacity)
+
+    @property
+    def normals(self) -> Float[Tensor, "H W 3"]:
+        """Unit vectors in world axes; 0 where nothing is."""
+        scene, seen = self.scene, self.coefficients
+        rays = self.camera.to(scene.device).image_rays(0)
+        normals = scene.renderer.normals(scene.field, rays, seen.ray_distance.flatten())
+        turned = normals @ torch.as_tensor(scene.frame.rotation, dtype=normals.dtype).to(normals)
+        return turned.view(*seen.accumulation.shape, 3) * seen.is_occupied[..., None]
+
+    @property
+    def has_removed(self) -> bool:
+        """Whether the scene is shown without some of its materials."""
+        return self.scene.has_removed
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> MaterialView:
+        """The same view with its coefficients on another device, or of some rows."""
+        return MaterialView(self.scene, self.camera, self.coefficients.map(function))
+
+    @torch.no_grad()
+    def __getitem__(self, name: str) -> Tensor:
+        """An output by its name, as `find_output` takes it."""
+        return self.scene.output(name).compute(self)
+
+
+def material_view(view: RenderedView) -> MaterialView | None:
+    """The view, if it is of mixed materials."""
+    return view if isinstance(view, MaterialView) else None
 
 
 def with_cells(renderer: VolumeRenderer, change: Callable[[Tensor], Tensor]) -> VolumeRenderer:

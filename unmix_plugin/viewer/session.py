@@ -22,7 +22,7 @@ from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.colour.conversion import illuminant_names
 from unmix_plugin.spectral.library.material_library import MaterialLibrary, measured_library
 from unmix_plugin.spectral.materials import Materials
-from unmix_plugin.trained.model_scene import LightChoice, RelightableScene, relit
+from unmix_plugin.trained.model_scene import LightChoice, lights_of, relit
 from unmix_plugin.trained.run_materials import endmember_colours
 from unmix_plugin.trained.run_views import recorded_views
 from unmix_plugin.viewer.page import number, paragraph, reporting_failures
@@ -82,8 +82,7 @@ class Services:
             for path in paths:
                 relit(scene, LightChoice(path), "of this run")
             self.has_materials = scene.materials is not None
-            lights = scene.lights if isinstance(scene, RelightableScene) else ()
-            self.lights: tuple[str, ...] = (*lights, *paths)
+            self.lights: tuple[str, ...] = (*lights_of(scene), *paths)
             """Names of the scene's lights, and the paths of those that a user gives."""
         self.maker = PictureMaker(source)
         self.regions = RunRegions(self.maker)

@@ -5,7 +5,7 @@ import re
 import pytest
 
 from tests.method_factory import WAVELENGTHS_NM, make_scene
-from unmix_plugin.engine.registry import Output
+from unmix_plugin.engine.outputs import Output
 from unmix_plugin.errors import UnmixError
 from unmix_plugin.products.render.files import choose_formats, file_name
 from unmix_plugin.trained.outputs import OUTPUTS

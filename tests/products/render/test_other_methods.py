@@ -10,7 +10,7 @@ import torch
 from tests.formats.video_reading import read_video
 from tests.products.render.render_factory import read_envi, read_exr, views
 from unmix_plugin.engine.geometry.space import SceneBox
-from unmix_plugin.engine.registry import WORLD_UNITS, Output
+from unmix_plugin.engine.outputs import WORLD_UNITS, Output
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.figures.look import Look
 from unmix_plugin.figures.paint import legend_of

@@ -10,8 +10,8 @@ from torch.testing import assert_close
 from tests.viewer.view_factory import make_frame, make_source
 from unmix_plugin.editing import Recipe
 from unmix_plugin.editing.recipe import Gloss, Remove
-from unmix_plugin.trained.outputs import MaterialView
-from unmix_plugin.trained.trained_scene import TrainedScene
+from unmix_plugin.trained import gradual
+from unmix_plugin.trained.trained_scene import MaterialView, TrainedScene
 from unmix_plugin.viewer.rendering import pictures
 from unmix_plugin.viewer.rendering.scene import Edit
 from unmix_plugin.viewer.rendering.settings import LayerSettings
@@ -28,13 +28,13 @@ def test_blocks_give_what_the_scene_gives_at_once(tmp_path, specular, subpixels,
     with source.locked() as scene:
         assert isinstance(scene, TrainedScene)
         expected = scene.look(camera, subpixels).coefficients
-        render = pictures.FrameRender(camera, subpixels)
+        render = gradual.FrameRender(camera, subpixels)
         total = 0
         while render.rays_left:
             total += render.render_block(scene, block)
         frame = render.frame(scene)
         assert isinstance(frame, MaterialView)
-        assert pictures._num_channels(scene.materials) == expected.packed.shape[-1]
+        assert gradual.numbers_per_pixel(scene) == expected.packed.shape[-1]
     assert total == render.num_rays == camera.width * camera.height * subpixels**2
     assert frame.coefficients.num_endmembers == expected.num_endmembers
     assert_close(frame.coefficients.packed, expected.packed, atol=1e-5, rtol=1e-5)
@@ -113,7 +113,7 @@ def test_depth_is_along_the_axis_where_something_is_and_far_elsewhere(source):
 def test_every_layer_shows_edits_of_gloss_and_of_what_is_there(tmp_path, edit):
     maker = pictures.PictureMaker(make_source(tmp_path))
     change = Edit(Recipe((edit,)))
-    render = pictures.FrameRender(camera_of(pose_of(maker.source.record.train_cameras[0]), 8))
+    render = gradual.FrameRender(camera_of(pose_of(maker.source.record.train_cameras[0]), 8))
     frame = maker.advance(render, change, render.num_rays, 1.0)
     assert isinstance(frame, MaterialView)
     for layer in set(maker.layers) - {"error", "index"}:

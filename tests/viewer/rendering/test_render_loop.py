@@ -12,8 +12,9 @@ from tests.viewer import view_factory
 from tests.viewer.view_factory import LARGEST, Screen, finest, finish, make_loop, some_pose
 from unmix_plugin.editing import Light, Recipe, Remove, Scale
 from unmix_plugin.engine.training.training_control import TrainingControl
-from unmix_plugin.trained.outputs import MaterialView
-from unmix_plugin.viewer.rendering.pictures import FrameRender, PictureMaker, _num_channels
+from unmix_plugin.trained.gradual import FrameRender, numbers_per_pixel
+from unmix_plugin.trained.trained_scene import MaterialView
+from unmix_plugin.viewer.rendering.pictures import PictureMaker
 from unmix_plugin.viewer.rendering.render_loop import View
 from unmix_plugin.viewer.rendering.scene import Edit
 from unmix_plugin.viewer.rendering.settings import LayerSettings
@@ -175,7 +176,7 @@ def test_a_picture_never_takes_more_memory_than_is_set_aside(source, monkeypatch
     loop.change(screen.view, pose=some_pose())
     picture = finest(loop, screen).picture
     with source.locked() as scene:
-        channels = _num_channels(scene.materials)
+        channels = numbers_per_pixel(scene)
     assert picture.shape[0] * picture.shape[1] * channels * 4 <= 20_000
 
 

@@ -19,9 +19,8 @@ from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.settings import SceneOptions
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.materials import Coefficients, Materials
-from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.trained.run_views import RunView
-from unmix_plugin.trained.trained_scene import TrainedScene
+from unmix_plugin.trained.trained_scene import MaterialView, TrainedScene
 from unmix_plugin.viewer.rendering import aids as aids_module
 from unmix_plugin.viewer.rendering import scene as scene_module
 from unmix_plugin.viewer.rendering.aids import SceneAids

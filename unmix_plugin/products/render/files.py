@@ -19,7 +19,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 import numpy as np
 from jaxtyping import UInt8
 
-from unmix_plugin.engine.registry import METRES, WORLD_UNITS, Output, OutputKind
+from unmix_plugin.engine.outputs import METRES, WORLD_UNITS, Output, OutputKind
 from unmix_plugin.errors import ConfigError, did_you_mean
 from unmix_plugin.figures.look import Look
 from unmix_plugin.figures.paint import (

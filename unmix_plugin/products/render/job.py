@@ -22,8 +22,8 @@ import torch
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.outputs import METRES, Output
 from unmix_plugin.engine.processes import ALONE, Processes
-from unmix_plugin.engine.registry import METRES, Output
 from unmix_plugin.figures.look import Look
 from unmix_plugin.figures.paint import needs_range
 from unmix_plugin.formats.video import FrameSink

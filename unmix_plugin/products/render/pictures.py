@@ -6,8 +6,8 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from unmix_plugin.engine.outputs import Output
 from unmix_plugin.engine.printing import plot_text
-from unmix_plugin.engine.registry import Output
 from unmix_plugin.figures.paint import ColourScale, Legend
 from unmix_plugin.figures.pictures import draw_legend_entries, legend_height
 from unmix_plugin.figures.plotting import Colour, draw_colour_bar, figure_bytes, page_in_inches

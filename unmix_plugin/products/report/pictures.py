@@ -16,8 +16,8 @@ import numpy as np
 import torch
 from jaxtyping import Float64, UInt8
 
-from unmix_plugin.engine.registry import Output
-from unmix_plugin.figures.paint import ColourScale, as_bytes, colour_table, paint, scale_of
+from unmix_plugin.engine.outputs import Output
+from unmix_plugin.figures.paint import as_bytes, paint, scale_of
 from unmix_plugin.figures.plotting import RIGHT, WRONG, ChartLine, Colour, SpectraChart, css_colour
 from unmix_plugin.formats.files import eight_bits
 from unmix_plugin.products.evaluation import material_look
@@ -187,13 +187,6 @@ def map_columns(count: int) -> int:
     if count <= _MAP_COLUMNS[0]:
         return max(count, 4)
     return min(_MAP_COLUMNS, key=lambda columns: -count % columns)
-
-
-def scale_strip(scale: ColourScale) -> np.ndarray:
-    """The colours of a scale from low to high, (12, 220, 3)."""
-    return np.repeat(
-        colour_table(scale.colour_map)[np.linspace(0, 255, 220).round().astype(int)][None], 12, axis=0
-    )
 
 
 def error_chart(views: ReportViews) -> SpectraChart | None:

@@ -25,6 +25,7 @@ from unmix_plugin.engine.runs.atomic_files import read_plain_json, read_run_json
 from unmix_plugin.engine.runs.config_json import config_to_json
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.errors import ConfigError, RunError, counted
+from unmix_plugin.figures.paint import scale_strip
 from unmix_plugin.figures.plotting import SpectraChart, css_colour, draw_chart
 from unmix_plugin.formats.files import eight_bits, write_file
 from unmix_plugin.formats.libraries import library_of
@@ -177,8 +178,8 @@ def _view_values(views: ReportViews) -> dict[str, Any]:
         "best_psnr_db": worst[-1].psnr_db if worst else None,
         "shares": pictures.share_pictures(views),
         "share_columns": pictures.map_columns(len(views.materials.names)),
-        "share_scale": (SHARE_SCALE, pictures.scale_strip(SHARE_SCALE)),
-        "error_scale": (ERROR_SCALE, pictures.scale_strip(ERROR_SCALE)),
+        "share_scale": (SHARE_SCALE, scale_strip(SHARE_SCALE, 220, 12)),
+        "error_scale": (ERROR_SCALE, scale_strip(ERROR_SCALE, 220, 12)),
         "segmentation": pictures.segmentation_section(views),
         "error_chart": pictures.error_chart(views),
     }

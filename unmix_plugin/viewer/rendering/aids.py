@@ -15,8 +15,8 @@ from unmix_plugin.editing import sample_seen
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.spectral.materials import Coefficients, Materials
 from unmix_plugin.spectral.subspace import PcaColours
-from unmix_plugin.trained.outputs import MaterialView, components_of
-from unmix_plugin.trained.trained_scene import TrainedScene, reference_rays
+from unmix_plugin.trained.outputs import components_of
+from unmix_plugin.trained.trained_scene import MaterialView, TrainedScene, reference_rays
 from unmix_plugin.viewer.rendering.scene import STEPS_KEPT, CachedByVersion, MeasuredViews, SceneSource
 
 _MOST_REMEMBERED = 32

@@ -27,8 +27,8 @@ from unmix_plugin.formats.video import OWN_GROUP
 from unmix_plugin.spectral.colour.conversion import rgb_matrix
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.model_scene import LightChoice
-from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.trained.protocol import RenderedView
+from unmix_plugin.trained.trained_scene import material_view
 
 SIDE_BOUNDS = (16, 8192)
 """Least and greatest width and height of a picture."""
@@ -54,9 +54,10 @@ Strip = tuple[Float32[np.ndarray, "h W B"], Float32[np.ndarray, "h W 3"], Float3
 
 def strip_of_spectra(frame: RenderedView) -> Strip:
     """Spectra, linear RGB and coverage of a strip of `h` rows."""
-    assert isinstance(frame, MaterialView)
-    linear_rgb = frame.materials.through(frame.coefficients, rgb_matrix(frame.materials.bands))
-    return frame["spectral"].cpu().numpy(), linear_rgb.cpu().numpy(), frame.coverage.cpu().numpy()
+    seen = material_view(frame)
+    assert seen is not None
+    linear_rgb = seen.materials.through(seen.coefficients, rgb_matrix(seen.materials.bands))
+    return seen["spectral"].cpu().numpy(), linear_rgb.cpu().numpy(), seen.coverage.cpu().numpy()
 
 
 def joined_strips(strips: Iterable[Sequence[np.ndarray]], height: int) -> list[np.ndarray]:

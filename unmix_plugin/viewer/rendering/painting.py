@@ -12,21 +12,15 @@ from html import escape
 
 import numpy as np
 
-from unmix_plugin.engine.registry import Output, OutputKind
+from unmix_plugin.engine.outputs import Output, OutputKind
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.figures.paint import ColourScale, Legend, Painted, colour_table, needs_range, paint
 from unmix_plugin.figures.plotting import css_colour
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION
-from unmix_plugin.trained.outputs import (
-    FAMILIES,
-    OUTPUTS,
-    MaterialView,
-    PictureValues,
-    picture_values,
-    usual_range,
-)
+from unmix_plugin.trained.outputs import FAMILIES, OUTPUTS, PictureValues, picture_values, usual_range
 from unmix_plugin.trained.protocol import RenderableScene, RenderedView
+from unmix_plugin.trained.trained_scene import MaterialView, material_view
 from unmix_plugin.viewer.page import BLOCK_STYLE, paragraph, swatches
 from unmix_plugin.viewer.rendering.aids import LayerAids
 from unmix_plugin.viewer.rendering.settings import LayerSettings, covered
@@ -96,8 +90,8 @@ def paint_layer(
         ConfigError: it can't be shown, as an error without measurements.
         SpectrumError: the bands don't cover what it needs.
     """
-    if isinstance(frame, MaterialView) and aids is not None:
-        output, shown, ends = _of_materials(layer, frame, settings, aids)
+    if (seen := material_view(frame)) is not None and aids is not None:
+        output, shown, ends = _of_materials(layer, seen, settings, aids)
     else:
         assert layer.row is not None, layer.name
         output, shown, ends = layer.row, picture_values(frame, layer.row), None

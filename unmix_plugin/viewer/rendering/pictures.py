@@ -12,22 +12,17 @@ import math
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from jaxtyping import Float32, UInt8
-from torch import Tensor
 
-from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.figures.paint import Legend, as_bytes, background_of
-from unmix_plugin.rendering.front_to_back import composite
-from unmix_plugin.spectral.materials import Coefficients, Materials
-from unmix_plugin.trained.model_scene import EstimatedScene, ModelView
+from unmix_plugin.trained.gradual import FrameRender, numbers_per_pixel, shown_with, wants_more
 from unmix_plugin.trained.open_run import require_materials
-from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.trained.protocol import RenderableScene, RenderedView
-from unmix_plugin.trained.trained_scene import TrainedScene
+from unmix_plugin.trained.trained_scene import MaterialView, TrainedScene, material_view
 from unmix_plugin.viewer.rendering.aids import SceneAids
 from unmix_plugin.viewer.rendering.painting import layer_named, layers_of, paint_layer
 from unmix_plugin.viewer.rendering.scene import Edit, SceneSource
@@ -87,106 +82,6 @@ def _finer_height(height: int, largest_height: int) -> int | None:
     return largest_height if 2 * height * 1.2 >= largest_height else 2 * height
 
 
-_CPU_CHUNK, _CUDA_CHUNK = 4096, 1 << 16
-"""Rays rendered at once: as many as the caches, or the device, have room for."""
-
-
-class FrameRender:
-    """A view under way. Blocks may come from different steps of a training; materials are those of the end."""
-
-    def __init__(
-        self, camera: Cameras, subpixels: int = 1, before: ModelView | None = None, is_finished: bool = False
-    ) -> None:
-        """`subpixels` rays along each edge of a pixel are averaged, and the view with estimates of the same, `before`;
-        `is_finished` if it has to be as fine as the scene makes it, rather than an estimate."""
-        self.camera = camera
-        self._subpixels, self._before, self._is_finished = subpixels, before, is_finished
-        self._num_pixels = camera.width * camera.height
-        self._stride = _coprime_stride(self._num_pixels)
-        self.num_rays = self._num_pixels * subpixels**2
-        """Rays of the whole view."""
-        self._rays_done = 0
-        self._coefficients: Coefficients | None = None
-        self._strips: list[dict[str, Tensor]] = []
-        self._num_wanted = 1
-
-    @property
-    def rays_left(self) -> int:
-        """Rays still to be rendered."""
-        return self.num_rays - self._rays_done
-
-    @torch.no_grad()
-    def render_block(self, scene: RenderableScene, num_rays: int) -> int:
-        """Render up to `num_rays` more; how many it were."""
-        done, chunk = 0, _CUDA_CHUNK if scene.device.type == "cuda" else _CPU_CHUNK
-        while done < num_rays and self.rays_left:
-            count = min(num_rays - done, chunk)
-            rendered = (
-                self._render_chunk(scene, count)
-                if isinstance(scene, TrainedScene)
-                else self._render_rows(scene, count)
-            )
-            self._rays_done += rendered
-            done += rendered
-        return done
-
-    def _render_chunk(self, scene: TrainedScene, num_rays: int) -> int:
-        turn, start = divmod(self._rays_done, self._num_pixels)
-        end = min(start + num_rays, self._num_pixels)
-        # Spread over the picture, so that every block has its share of what is empty and of what is costly.
-        pixels = torch.arange(start, end, device=scene.device) * self._stride % self._num_pixels
-        rows, columns = pixels // self.camera.width, pixels % self.camera.width
-        y, x = ((part + 0.5) / self._subpixels for part in divmod(turn, self._subpixels))
-        coords = torch.stack([columns + x, rows + y], dim=-1).to(torch.float32)
-        bundle = self.camera.to(scene.device).generate_rays(torch.zeros_like(pixels), coords)
-        block = composite(scene.renderer, scene.field, bundle)
-        if self._coefficients is None:
-            self._coefficients = block.map(lambda packed: packed.new_zeros(self._num_pixels, packed.shape[1]))
-        self._coefficients.packed[pixels] += block.packed / self._subpixels**2
-        return end - start
-
-    def _render_rows(self, scene: RenderableScene, num_rays: int) -> int:
-        """Whole rows from top to bottom, of a scene that only renders views; one ray a pixel."""
-        row_rays = self.camera.width * self._subpixels**2
-        first = self._rays_done // row_rays
-        count = min(max(1, num_rays // row_rays), self.camera.height - first)
-        camera = self.camera.crop(0, first, self.camera.width, count).to(scene.device)
-        if isinstance(scene, EstimatedScene) and self._is_finished:
-            strip = scene.look(camera, self._subpixels)
-        elif isinstance(scene, EstimatedScene):
-            number = 0 if self._before is None else self._before.num_estimates
-            strip = scene.estimate(camera, self._subpixels, number)
-            self._num_wanted = strip.num_wanted
-        else:
-            strip = scene.look(camera)
-        named = {output.name: strip[output.name] for output in scene.outputs}
-        self._strips.append({"accumulation": strip.opacity, **named})
-        return count * row_rays
-
-    def frame(self, scene: RenderableScene) -> RenderedView:
-        """The finished view, with the materials of a scene that has some."""
-        assert self.rays_left == 0
-        if isinstance(scene, TrainedScene):
-            assert self._coefficients is not None
-            image = self._coefficients.unflatten(self.camera.height, self.camera.width)
-            return MaterialView(scene, self.camera, image)
-        tensors = {name: torch.cat([strip[name] for strip in self._strips]) for name in self._strips[0]}
-        view = ModelView(self.camera, tensors, num_wanted=self._num_wanted)
-        return view if self._before is None else self._before.averaged(view)
-
-
-def _num_channels(materials: Materials) -> int:
-    return 2 + 2 * len(materials.endmembers) + len(materials.specular_spectra)
-
-
-def _coprime_stride(count: int) -> int:
-    """A step through `count` pixels that meets each once and that spreads any run of them evenly."""
-    stride = max(1, round(count * 0.6180339887))
-    while math.gcd(stride, count) != 1:
-        stride += 1
-    return stride
-
-
 _FAR = 160.0
 """Depth of what is transparent, scene units; the browser's own limit is 167."""
 
@@ -243,8 +138,7 @@ class PictureMaker:
             self.layers = layers_of(scene)
             """What can be shown, by name."""
             self.aids = SceneAids(source)
-            materials = scene.materials
-            numbers = 4 * len(scene.outputs) if materials is None else _num_channels(materials)
+            numbers = numbers_per_pixel(scene)
         self._largest_pixels = max(256, LARGEST_FRAME_BYTES // (4 * numbers))
 
     def first_render(self, pose: ViewPose, largest_height: int) -> FrameRender:
@@ -258,7 +152,7 @@ class PictureMaker:
     ) -> FrameRender:
         """The picture after `frame`: a finer one, another estimate of the same, or at the end the same again."""
         target = self.target_height(pose, largest_height)
-        if isinstance(frame, ModelView) and frame.camera.height >= target and wants_more(frame):
+        if frame.camera.height >= target and wants_more(frame):
             return FrameRender(frame.camera, subpixels, frame)
         height = _finer_height(frame.camera.height, target) or target
         is_last = height == target and not self.source.device.is_training
@@ -303,21 +197,18 @@ class PictureMaker:
 
     def with_materials_of(self, edit: Edit, frame: RenderedView) -> RenderedView:
         """What a frame would be with other materials on the same shapes; an UnmixError if the edit does not fit."""
-        return replace(frame, scene=self.edited(edit)) if isinstance(frame, MaterialView) else frame
+        with self.locked_view(edit) as (_, shown):
+            return shown_with(frame, shown)
 
     def paint(
         self, frame: RenderedView, settings: LayerSettings, with_depth: bool, is_moving: bool
     ) -> Picture:
         """A frame as a picture; an UnmixError if the layer can't be shown."""
         layer = layer_named(settings.layer, self.layers)
-        aids = self.aids.for_layers(frame.scene) if isinstance(frame, MaterialView) else None
+        seen = material_view(frame)
+        aids = None if seen is None else self.aids.for_layers(seen.scene)
         with torch.no_grad():
             painted = paint_layer(layer, frame, settings, aids)
             picture = as_bytes(painted.over(background_of(settings))[:, :, 0])
-        depth = _picture_depth(frame) if with_depth and isinstance(frame, MaterialView) else None
+        depth = None if seen is None or not with_depth else _picture_depth(seen)
         return Picture(picture, depth, painted.legend, is_moving, layer.is_labels)
-
-
-def wants_more(frame: RenderedView) -> bool:
-    """Whether a frame is an estimate that is to be averaged with others."""
-    return isinstance(frame, ModelView) and frame.num_estimates < frame.num_wanted

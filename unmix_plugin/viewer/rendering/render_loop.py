@@ -16,15 +16,14 @@ from typing import Any
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.errors import ConfigError
+from unmix_plugin.trained.gradual import FrameRender, wants_more
 from unmix_plugin.trained.protocol import RenderedView
 from unmix_plugin.viewer.page import reporting_failures
 from unmix_plugin.viewer.rendering.pictures import (
     DEFAULT_HEIGHT,
     RESTING_COST,
-    FrameRender,
     Picture,
     PictureMaker,
-    wants_more,
 )
 from unmix_plugin.viewer.rendering.scene import Edit
 from unmix_plugin.viewer.rendering.settings import LayerSettings

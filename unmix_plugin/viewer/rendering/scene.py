@@ -29,11 +29,10 @@ from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Coefficients
 from unmix_plugin.trained.measures import Scale, read_measures, recorded_scale
 from unmix_plugin.trained.model_scene import LightChoice, relit
 from unmix_plugin.trained.open_run import LoadedRun, require_materials, snapshot
-from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.trained.places import MeasuredScene, same_places
 from unmix_plugin.trained.protocol import RenderableScene
 from unmix_plugin.trained.surface import in_image
-from unmix_plugin.trained.trained_scene import TrainedScene
+from unmix_plugin.trained.trained_scene import MaterialView, TrainedScene
 
 _ValueT = TypeVar("_ValueT")
 
