@@ -33,12 +33,14 @@ _CELLS = 8
 """From the middle of a picture, or of the sphere of directions, to its end; pixels of a cell are compared."""
 _RADII = (1.1, 1.5, 2.0, 3.0)
 """Of spheres around the cameras, in distances of the farthest from the point that all look at, or from their middle."""
-_TOLERANCE = 0.04
+_TOLERANCE = 0.02
 """Of the brightest background, by which a view may differ from the mean of all in a cell."""
+_LEAST_OF_BRIGHTEST = 0.25
+"""Of the brightest pixels, what background counts as at least: what is black differs by noise alone."""
 MOST_DIFFERENT = 0.1
-"""Share of cells in which views differ, of a backdrop: skies have 0, plain rooms 0.24 and more."""
+"""Share of cells in which views differ, of a backdrop: skies have 0 to 0.002, plain rooms 0.3 and more."""
 _NEARER = 0.8
-"""Of that share, what a sphere at a finite distance leaves where a surface is: 0.33 to 0.75 in plain rooms, but 1 where
+"""Of that share, what a sphere at a finite distance leaves where a surface is: 0.25 to 0.76 in plain rooms, but 1 where
 views differ for another reason, such as their exposures."""
 
 
@@ -125,7 +127,8 @@ def measure_distance(views: Views, before: BeforeBackdrop) -> BackgroundDistance
         np.concatenate([getattr(one, name) for one in pixels])
         for name in ("spectra", "origins", "directions", "places")
     )
-    scale = float(np.percentile(np.linalg.norm(spectra, axis=1), 99))
+    background = float(np.percentile(np.linalg.norm(spectra, axis=1), 99))
+    scale = max(background, _LEAST_OF_BRIGHTEST * float(np.median([one.brightest for one in pixels])))
     if not scale > 0:
         return BackgroundDistance(0.0, 0.0)
 
@@ -149,6 +152,8 @@ class _Background:
     """Unit vectors."""
     places: Float64[np.ndarray, "P 2"]
     """In the picture, [-1, 1]."""
+    brightest: float
+    """Length of the spectra of the brightest pixels of the view, matter too."""
 
 
 def _background(views: Views, before: BeforeBackdrop) -> Iterator[_Background]:
@@ -158,12 +163,13 @@ def _background(views: Views, before: BeforeBackdrop) -> Iterator[_Background]:
         if len(rows) == 0:
             continue
         every = slice(None, None, before.stride)
-        seen = views.read(view, (every, every, slice(None)))[rows, columns].astype(np.float64)
+        image = views.read(view, (every, every, slice(None))).astype(np.float64)
+        seen, brightest = image[rows, columns], float(np.percentile(np.linalg.norm(image, axis=2), 99))
         coords = torch.from_numpy(np.stack([columns, rows], axis=1) * before.stride).float() + 0.5
         rays = views.cameras.generate_rays(torch.full((len(coords),), view), coords)
         directions = torch.nn.functional.normalize(rays.directions.double(), dim=-1).numpy()
         places = 2 * coords.double().numpy() / np.array(before.size) - 1
-        yield _Background(seen, rays.origins.double().numpy(), directions, places)
+        yield _Background(seen, rays.origins.double().numpy(), directions, places, brightest)
 
 
 def _on_sphere(
