@@ -92,8 +92,16 @@ def check_frames(
         if shown is not None:
             seen = shown[index]
             foreground = _union(np.ones(size, bool) if seen is None else seen, unknown)
-        path = frame.files[CUBE_KEY]
-        checked.append(CheckedFrame(path, cube.sha256, size, indices[index], unknown, foreground))
+        checked.append(
+            CheckedFrame(
+                cube=frame.files[CUBE_KEY],
+                sha256=cube.sha256,
+                size=size,
+                sensor=indices[index],
+                unknown=unknown,
+                foreground=foreground,
+            )
+        )
     return CheckedFiles(tuple(checked), sensors, warn_clipped(cubes, options.value_scale))
 
 

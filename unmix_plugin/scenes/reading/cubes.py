@@ -186,15 +186,20 @@ def _measure_cube(path: Path, options: SceneOptions, where: str = "") -> _CubeVa
         invalid[rows] = _find_invalid(block, options)
         greatest = max(greatest, float(stored.max(where=finite, initial=0.0)))
         least = min(least, float(block.min(where=finite, initial=0.0)))
+    num_nan, num_infinite, num_negative, num_far_negative, num_above_one = totals.tolist()
     return _CubeValues(
-        where,
-        sha256_of(path),
-        cube.size,
-        invalid.size,
-        cube.dtype.kind in "iu",
-        greatest,
-        least,
-        *totals.tolist(),
+        where=where,
+        sha256=sha256_of(path),
+        num_values=cube.size,
+        num_pixels=invalid.size,
+        is_integer=cube.dtype.kind in "iu",
+        greatest=greatest,
+        least=least,
+        num_nan=num_nan,
+        num_infinite=num_infinite,
+        num_negative=num_negative,
+        num_far_negative=num_far_negative,
+        num_above_one=num_above_one,
         invalid=invalid if invalid.any() else None,
     )
 

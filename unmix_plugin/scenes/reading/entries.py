@@ -109,9 +109,15 @@ def read_entries(root: Path, faults: Faults, needs_cubes: bool = True) -> SceneE
             faults.note(where, Message.NO_CUBE)
         elif frame.get(CUBE_KEY) is None and frame.get("file_path") is None:
             faults.note(where, Message.NO_PICTURE)
-        camera = FrameCamera.read(scene, frame, where, faults)
-        bands = None if own.bands is None else tuple(own.bands)
-        frames.append(FrameEntry(where, own.paths, camera, own.sensor, bands, own.shot))
+        entry = FrameEntry(
+            where=where,
+            paths=own.paths,
+            camera=FrameCamera.read(scene, frame, where, faults),
+            sensor=own.sensor,
+            bands=None if own.bands is None else tuple(own.bands),
+            shot=own.shot,
+        )
+        frames.append(entry)
     placement, metres_per_unit = read_placement(scene, FILE_NAME, faults)
     return SceneEntry(
         keys=keys,

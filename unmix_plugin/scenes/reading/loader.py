@@ -103,7 +103,13 @@ def _read_truth(root: Path, entry: SceneEntry, options: SceneOptions, faults: Fa
     if materials_path is not None and bands is not None:
         table = read_endmembers(materials_path, bands, names, faults)
         names, endmembers = (names, None) if table is None else (table.names, table.spectra)
-    return _Truth(names, illuminant, endmembers, light_path, materials_path)
+    return _Truth(
+        material_names=names,
+        illuminant=illuminant,
+        endmembers=endmembers,
+        light_path=light_path,
+        materials_path=materials_path,
+    )
 
 
 def read_endmembers(

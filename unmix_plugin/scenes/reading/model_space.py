@@ -126,5 +126,11 @@ def find_model_space(
     normalisation = Normalisation(first.rotation, translation, first.scale * scale)
     own_box = SceneBox(torch.from_numpy(np.stack([-half, half])).float())
     return ModelSpace(
-        normalisation, own_box, is_unbounded, before, reason, tuple(decisions), backdrop.warnings
+        normalisation=normalisation,
+        scene_box=own_box,
+        is_unbounded=is_unbounded,
+        before_backdrop=before,
+        world_reason=reason,
+        decisions=tuple(decisions),
+        warnings=backdrop.warnings,
     )
