@@ -253,6 +253,9 @@ def unfollowed_keys(
         for key, meaning in _NOT_FOLLOWED.items()
         if any(_is_set(values.get(key)) for values in every)
     ]
+    if scene.get("space") not in (None, "world"):
+        meaning = "cameras in the model space of a run; write them in the world that its scene has"
+        warnings.append(Message.KEY_NOT_FOLLOWED.sentence(key="space", meaning=meaning))
     twice = [
         key
         for key in _LENS_OF_NERFSTUDIO

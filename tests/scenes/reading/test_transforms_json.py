@@ -196,3 +196,11 @@ def test_widths_of_bands_are_unknown_where_one_is_null_or_0(folder, last, known)
     if known:
         np.testing.assert_array_equal(scene.fwhm_nm, np.full(4, 7.5))
     assert ["'fwhm' has 0 or null for 1 of" in said for said in scene.warnings] == [True] * (not known)
+
+
+def test_cameras_of_a_camera_file_in_model_space_are_named_where_a_world_is_expected(folder):
+    for space, is_named in (("world", False), ("model", True)):
+        warnings = load_scene(
+            folder.edit(lambda content, space=space: content.update(space=space)).root
+        ).warnings
+        assert ["'space' is set and not followed" in warning for warning in warnings] == [True] * is_named
