@@ -213,6 +213,7 @@ MASKS = [
     "masks/{0}.png",
     "masks/{0}.jpg",
     "mask/{0}_mask.png",
+    "Masks/mask_{0}.PNG",
     "masks/{0}.mask.png",
     "masks/images/{0}.png.png",
     "images/masks/{0}.png",

@@ -171,6 +171,18 @@ def test_what_can_be_read_in_two_ways_is_refused_with_both(kind, tmp_path):
             read(tmp_path / "table.csv")
 
 
+@pytest.mark.parametrize("head", ["Wavenumber Reflectance", "cm-1 R", "Energy (eV) Reflectance"])
+def test_numbers_that_are_no_wavelengths_are_refused(head, tmp_path):
+    (tmp_path / "spectrum.txt").write_text(f"{head}\n400 0.25\n500 0.5\n")
+    with pytest.raises(SpectrumError, match="names no wavelengths"):
+        read_library(tmp_path / "spectrum.txt")
+
+
+def test_three_decimals_beside_a_whole_number_are_decimals(tmp_path):
+    (tmp_path / "table.csv").write_text("wavelength;leaf\n400,125;0,250\n402;0,375\n404,375;0,125\n")
+    np.testing.assert_allclose(read_spectra(tmp_path / "table.csv").bands.centers_nm, [400.125, 402, 404.375])
+
+
 def test_a_channel_that_was_measured_over_a_part_responds_to_nothing_beyond(tmp_path):
     rows = "400;;0,1\n500;0,2;0,4\n600;1,0;0,2\n700;0,1;NaN\n"
     (tmp_path / "camera.csv").write_text(f"Wellenlaenge (nm);red;blue\n{rows}")

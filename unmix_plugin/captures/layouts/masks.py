@@ -12,6 +12,7 @@ Folders below images/ are the same below masks/. Sources: colmap 2599, 3611; Ope
 
 from __future__ import annotations
 
+import unicodedata
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +20,6 @@ from pathlib import Path
 from unmix_plugin.captures.cube import Capture, CaptureView
 from unmix_plugin.captures.writing.view_files import alpha_picture
 from unmix_plugin.errors import CaptureError, name_some
-from unmix_plugin.scenes.reading.faults import find_named
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 _MARKS = ("_mask", ".mask", "-mask")
@@ -29,14 +29,39 @@ MASK_FOLDERS = ("masks", "mask")
 def with_mask_files(capture: Capture) -> Capture:
     """The capture with a mask for each view that has neither one nor an alpha channel. Raises CaptureError: a view has
     none, with where it was looked for."""
-    views = []
+    views, folders = [], _Folders()
     for view in capture.views:
         if view.mask is None and view.alpha is None and alpha_picture(view) is None:
-            view = replace(view, mask=_find_mask(view, capture.root))
+            view = replace(view, mask=_find_mask(view, capture.root, folders))
             if view.mask is None:
                 _refuse(view, capture)
         views.append(view)
     return replace(capture, views=tuple(views))
+
+
+class _Folders:
+    """Files of folders by name, whatever the capitals and the form of umlauts, each folder listed once."""
+
+    def __init__(self) -> None:
+        self._files: dict[Path, dict[str, Path]] = {}
+
+    def find(self, folder: Path, name: str) -> Path | None:
+        """The file of this name, in the folder or one that differs from it in capitals."""
+        if folder not in self._files:
+            self._files[folder] = {_key(path.name): path for path in self._place(folder) if path.is_file()}
+        return self._files[folder].get(_key(name))
+
+    @staticmethod
+    def _place(folder: Path) -> list[Path]:
+        alike = [folder] if folder.is_dir() else []
+        if not alike and folder.parent.is_dir():
+            others = sorted(folder.parent.iterdir())
+            alike = [other for other in others if _key(other.name) == _key(folder.name) and other.is_dir()]
+        return [path for one in alike for path in sorted(one.iterdir())]
+
+
+def _key(name: str) -> str:
+    return unicodedata.normalize("NFC", name).casefold()
 
 
 def is_mask_of(path: Path, others: Iterable[Path]) -> bool:
@@ -46,10 +71,10 @@ def is_mask_of(path: Path, others: Iterable[Path]) -> bool:
     return any(name in files for name in marked) or (Path(path.stem).suffix != "" and path.stem in files)
 
 
-def _find_mask(view: CaptureView, root: Path) -> Path | None:
+def _find_mask(view: CaptureView, root: Path, folders: _Folders) -> Path | None:
     own = {path.resolve() for path in _images(view)}
     for folder, name in _candidates(view, root):
-        found = find_named(folder, name)
+        found = folders.find(folder, name)
         if found is not None and found.resolve() not in own:
             return found
     return None
@@ -66,6 +91,7 @@ def _candidates(view: CaptureView, root: Path) -> list[tuple[Path, str]]:
     for image in _images(view):
         stems = dict.fromkeys([image.name, image.stem, Path(image.stem).stem, view.name])
         marked = [f"{stem}{mark}{suffix}" for stem in stems for mark in _MARKS for suffix in _SUFFIXES]
+        marked += [f"mask_{stem}{suffix}" for stem in stems for suffix in _SUFFIXES]
         inside = [f"{stem}{suffix}" for stem in stems for suffix in _SUFFIXES]
         found += [
             (folder, name) for folder in _mask_folders(image.parent, root) for name in [*inside, *marked]

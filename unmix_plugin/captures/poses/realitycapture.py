@@ -49,6 +49,7 @@ def read_realitycapture(path: Path, sizes: Mapping[str, tuple[int, int]]) -> Pos
     except csv.Error as error:
         raise CaptureError(f"{path} is no table ({error})") from error
     dialect, rows = table if table is not None else (Dialect(",", "."), [])
+    rows = [(line, {"alt": row["z"], **row} if "z" in row else row) for line, row in rows]
     lacking = [key for key in (*_POSE, "f") if rows and key not in rows[0][1]]
     if not rows or lacking:
         raise CaptureError(

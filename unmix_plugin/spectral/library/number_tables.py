@@ -341,7 +341,8 @@ def _plain(cell: str) -> str:
 
 
 def _refuse_thousands(lines: Sequence[str], dialect: Dialect) -> None:
-    """Refuse a column in which `1,002` stands beside `998`: a thousand and two, or one?"""
+    """Refuse a column in which `1,002` stands beside `998`: a thousand and two, or one? Decimals lie near the numbers
+    beside them."""
     if dialect.delimiter == "," or not any(map(_THOUSANDS.search, lines)):
         return
     columns: dict[int, list[str]] = {}
@@ -352,10 +353,18 @@ def _refuse_thousands(lines: Sequence[str], dialect: Dialect) -> None:
     for cells in columns.values():
         signed = [cell for cell in cells if "." in cell or "," in cell]
         plain = [cell for cell in cells if cell.isdecimal() and len(cell) == 3]
-        if signed and plain and all(map(_THOUSANDS.fullmatch, signed)):
-            one = signed[0]
-            digits = re.sub(r"[.,]", "", one)
+        if not (signed and plain and all(map(_THOUSANDS.fullmatch, signed))):
+            continue
+        whole = [float(re.sub(r"[.,]", "", cell)) for cell in cells]
+        decimal = [dialect.number(cell) or 0.0 for cell in cells]
+        if _spread(whole) < _spread(decimal):
             raise SpectrumError(
-                f"'{one}' beside '{plain[0]}' can be read in two ways, as {dialect.number(one):g} and as {digits}; "
-                "save it without signs for thousands"
+                f"'{signed[0]}' beside '{plain[0]}' can be read in two ways, as {dialect.number(signed[0]):g} and as "
+                f"{re.sub(r'[.,]', '', signed[0])}; save it without signs for thousands"
             )
+
+
+def _spread(values: Sequence[float]) -> float:
+    """The greatest over the least that is above 0."""
+    above = [value for value in values if value > 0]
+    return max(above) / min(above) if above else 1.0

@@ -56,6 +56,10 @@ _RAW = re.compile(r"\b(?:rad|radiance|irrad|irradiance|dn|counts?|reference|targ
 _GENERAL = re.compile(
     r"values?|(?:rel\w*\.? )?refl\w*\.?(?: \[1\.0\])?|tgt\.?/ref\.?|intensity|data|y", re.IGNORECASE
 )
+_NO_WAVELENGTH = re.compile(
+    r"wave ?numbers?|\bcm\s?\^?-1|\b1/cm\b|frequency|\b[TG]?Hz\b|photon energy|\beV\b", re.IGNORECASE
+)
+"""In the line above numbers without a head."""
 _MARKERS, _HIGHEST_MARKER, _LEAST_REFLECTANCE = (-999.0, -9999.0), -99.0, -0.99
 """Stored numbers that stand for what was not measured: the first, and what is at most both of the others, as it is
 stored and as a reflectance. Noise stored as ten-thousandths reaches one alone."""
@@ -166,6 +170,10 @@ def _named_columns(path: Path, head: Sequence[str], wavelengths: int) -> tuple[l
 
 def _title(path: Path, table: NumberTable, stated: Mapping[str, str], is_record: bool) -> str:
     """What a spectrum without a head is called, refused where more than one stands there."""
+    if table.words and _NO_WAVELENGTH.search(table.words[-1]):
+        raise SpectrumError(
+            f"'{table.words[-1][:60]}' names no wavelengths; expected them in nm or micrometres: convert them"
+        )
     is_usgs = is_record or any("USGS" in line for line in table.words[:3])
     count = table.values.shape[1]
     if count > 2 + is_usgs:  # those of USGS have deviations in the third column
