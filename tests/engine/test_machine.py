@@ -44,3 +44,13 @@ def test_seeding_everything_repeats_torch_numpy_and_python():
         return float(torch.rand(())), float(np.random.rand()), random.random()  # noqa: NPY002
 
     assert draw() == draw()
+    assert draw()[0] == float(torch.rand(torch.Size(), generator=torch.Generator().manual_seed(5)))
+
+
+@pytest.mark.parametrize("is_used", [True, False])
+def test_gpus_are_seeded_where_they_are_in_use(monkeypatch, is_used):
+    seeded = []
+    monkeypatch.setattr(torch.cuda, "is_initialized", lambda: is_used)
+    monkeypatch.setattr(torch.cuda, "manual_seed_all", seeded.append)
+    seed_everything(7)
+    assert seeded == ([7] if is_used else [])

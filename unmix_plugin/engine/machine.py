@@ -100,6 +100,9 @@ def step_generator(
 
 def seed_everything(seed: int) -> None:
     """Seed the global generators of torch, NumPy and Python, which a method's own code may use."""
-    torch.manual_seed(seed)
+    # torch.manual_seed records a call for each kind of device that is not in use, which takes longer than all of this.
+    torch.default_generator.manual_seed(seed)
+    if torch.cuda.is_initialized():
+        torch.cuda.manual_seed_all(seed)
     np.random.seed(step_seed(seed, 0) & 0xFFFFFFFF)  # noqa: NPY002
     random.seed(seed)
