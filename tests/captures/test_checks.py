@@ -16,7 +16,7 @@ from tests.scenes.scene_factory import look_at
 from unmix_plugin.captures.checks import SeenView, _overlap, check_views
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet
-from unmix_plugin.captures.report import report_text
+from unmix_plugin.captures.report import Code, Kind, report_text, sentences
 from unmix_plugin.captures.writing.scene_files import _OUTLINE, _contact_sheet
 from unmix_plugin.captures.writing.view_files import ViewRecord, _detail
 from unmix_plugin.spectral.colour.srgb import encode_srgb
@@ -37,8 +37,8 @@ def sound(tmp_path_factory: pytest.TempPathFactory):
 
 
 def test_nothing_is_wrong_with_a_good_capture(sound):
-    findings: list[str] = []
-    measured = check_views(sound, ball_points(), findings)
+    remarks = check_views(sound, ball_points())
+    findings, measured = (sentences(remarks, kind) for kind in (Kind.WRONG, Kind.MEASURED))
     assert findings == []
     text = report_text("a title", findings, measured, ["something"])
     assert "none of the checks found a fault" in text
@@ -100,31 +100,28 @@ def with_a_wall(folder):
 @pytest.mark.parametrize("kind", FAULTS)
 def test_what_looks_wrong_is_found_once_with_the_views_it_is_in(tmp_path: Path, kind: str):
     make, said = FAULTS[kind]
-    views, findings = make(tmp_path), []
-    check_views(views, ball_points(), findings)
+    views = make(tmp_path)
+    findings = sentences(check_views(views, ball_points()), Kind.WRONG)
     assert sum(said in finding for finding in findings) == 1, findings
     assert len(views) < 15 or len(findings) == 1
 
 
 def test_what_can_not_be_judged_is_not_found_wrong(tmp_path: Path):
     flashed = _views(tmp_path, ring_of(32), light=None, gains={4: 0.7})
-    findings: list[str] = []
-    check_views(flashed, None, findings)  # without points
-    check_views(_views(tmp_path, ring_of(16, 60.0, (10.0, 14.0))), None, findings)  # on one side
-    assert findings == []
-    check_views(flashed[::7], ball_points(), findings)
-    assert not any("light" in finding for finding in findings)
+    one_side = _views(tmp_path, ring_of(16, 60.0, (10.0, 14.0)))
+    for views in (flashed, one_side):  # without points
+        assert sentences(check_views(views, None), Kind.WRONG) == []
+    assert Code.LIGHT_MOVES not in {remark.code for remark in check_views(flashed[::7], ball_points())}
 
 
 def test_overlap_of_cameras_in_parallel_takes_sparse_points(tmp_path: Path):
     down = view_at(tmp_path, "a", np.array([0.0, 0.01, 4.0]), LAMP)
     poses = [down.camera.camera_to_world + np.eye(3, 4, 3) * x for x in (0.0, 0.5, 1.0, 9.0)]
     views = [replace(down, camera=replace(down.camera, camera_to_world=pose)) for pose in poses]
-    findings: list[str] = []
-    _overlap(views, None, findings)
-    assert findings == []
-    assert "least 0%" in _overlap(views, ball_points(), findings)
-    assert "1 view with hardly any overlap with another one (at most 0%, from 0 degrees away)" in findings[0]
+    assert [remark.code for remark in _overlap(views, None)] == [Code.OVERLAP_UNJUDGED]
+    overlap, alone = _overlap(views, ball_points())
+    assert (overlap.code, overlap.values["least"]) == (Code.OVERLAP, "0%")
+    assert "1 view with hardly any overlap with another one (at most 0%, from 0 degrees" in alone.sentence
 
 
 def test_detail_falls_when_a_picture_is_blurred():

@@ -14,10 +14,15 @@ from unmix_plugin.captures.calibration.calibration import Calibration, Raster
 from unmix_plugin.captures.cube import CaptureView
 from unmix_plugin.captures.decide import background_rule, choose_mask
 from unmix_plugin.captures.readers.opening import open_spectral_file
-from unmix_plugin.captures.writing.view_files import UNLABELLED, ViewRecipe, alpha_picture, write_view
+from unmix_plugin.captures.writing.view_files import (
+    UNLABELLED,
+    ViewRecipe,
+    alpha_picture,
+    read_view_masks,
+    write_view,
+)
 from unmix_plugin.captures.writing.view_files import _clean as clean
 from unmix_plugin.captures.writing.view_files import _read_labels as read_labels
-from unmix_plugin.captures.writing.view_files import _read_view_masks as read_view_masks
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.spectral.colour.srgb import decode_srgb
 

@@ -12,6 +12,7 @@ from tests.captures.file_factory import file_of
 from unmix_plugin.captures.cube import BandTable, CaptureView
 from unmix_plugin.captures.decide import is_below_black
 from unmix_plugin.captures.options import ProcessOptions
+from unmix_plugin.captures.report import Kind, sentences
 from unmix_plugin.captures.value_checks import ViewSample, check_files, check_values
 from unmix_plugin.captures.writing.view_files import ViewRecord
 
@@ -39,9 +40,7 @@ def scene() -> list[ViewSample]:
 def findings(samples: list[ViewSample]) -> list[str]:
     """Of views on a ring."""
     steps = np.abs(np.subtract.outer(np.arange(10), np.arange(10)))
-    found: list[str] = []
-    check_values(samples, 12.0 * np.minimum(steps, 10 - steps), WAVELENGTHS_NM, found)
-    return found
+    return sentences(check_values(samples, 12.0 * np.minimum(steps, 10 - steps), WAVELENGTHS_NM), Kind.WRONG)
 
 
 def test_a_scene_that_is_right_gives_no_finding():
@@ -67,10 +66,8 @@ def test_what_light_does_not_do_is_found_and_named(change, words):
 
 def test_a_band_is_not_judged_by_bands_beyond_a_gap():
     kept, lamp = [0, 1, 2, 6, 7, 8, 9, 10, 11], 1 / (1 + ((WAVELENGTHS_NM - 550) / 60) ** 2)
-    found: list[str] = []
     samples = [replace(one, spectra=(one.spectra * lamp)[:, kept].astype(np.float32)) for one in scene()]
-    check_values(samples, np.full((10, 10), 30.0), WAVELENGTHS_NM[kept], found)
-    assert found == []
+    assert check_values(samples, np.full((10, 10), 30.0), WAVELENGTHS_NM[kept]) == []
 
 
 @pytest.mark.parametrize(
@@ -91,7 +88,7 @@ INVERTED = {"brightness": 0.001, "background_brightness": 0.4, "background_sprea
     [
         (10, INVERTED, False, "the wrong way round"),
         (10, INVERTED | {"background_spread": 0.05}, False, None),  # dark matter before a white backdrop
-        (7, {}, True, "7 views whose mask takes the border of the picture for matter and its middle"),
+        (7, {}, True, "7 views whose mask takes the border of the picture for foreground and its middle"),
         (5, {}, True, None),
         (1, {"matter_share": 0.95}, False, "view_0 (95%, near ones 50%)"),
     ],
@@ -124,18 +121,15 @@ def test_a_file_of_which_most_was_not_read_is_named(tmp_path: Path):
     path.write_bytes(bytes(200_000))
     cube = replace(file_of(np.zeros((40, 50, 3), np.float32)), path=path)
     views = [CaptureView("view", cube)]
-    found: list[str] = []
-    check_files(views, replace(OPTIONS, dataset="spectral"), found)  # chosen on purpose
-    assert found == []
-    check_files(views, OPTIONS, found)
-    assert "view.exr (3 bands of 0.2 MB)" in found[0]
+    assert check_files(views, replace(OPTIONS, dataset="spectral")) == []  # chosen on purpose
+    (remark,) = check_files(views, OPTIONS)
+    assert "view.exr (3 bands of 0.2 MB)" in remark.sentence
     path.write_bytes(bytes(30_000))
-    check_files(views, OPTIONS, found)
-    assert len(found) == 1
+    assert check_files(views, OPTIONS) == []
 
 
 def test_a_band_too_wide_for_one_wavelength_is_named(tmp_path: Path):
-    table, found = BandTable(np.array([560.0, 634.5]), "tags", fwhm_nm=np.array([27.0, 463.0])), []
+    table = BandTable(np.array([560.0, 634.5]), "tags", fwhm_nm=np.array([27.0, 463.0]))
     cube = replace(file_of(np.zeros((4, 5, 2), np.float32)), path=tmp_path / "none", bands=table)
-    check_files([CaptureView("view", cube)], OPTIONS, found)
-    assert "634.5 nm (463 nm wide)" in found[0]
+    (remark,) = check_files([CaptureView("view", cube)], OPTIONS)
+    assert "634.5 nm (463 nm wide)" in remark.sentence

@@ -21,11 +21,11 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
 from unmix_plugin.captures.poses.pose_set import PosedCamera
+from unmix_plugin.captures.report import Code, Remark
 from unmix_plugin.captures.writing.view_files import ViewRecord
 from unmix_plugin.engine.geometry.camera_paths import meeting_point
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.sampling import evenly_spaced
-from unmix_plugin.errors import counted, name_some
 from unmix_plugin.scenes.doctor import check_lenses, check_masks, contradicted_share
 from unmix_plugin.spectral.colour.srgb import decode_srgb
 
@@ -120,24 +120,18 @@ class SeenView:
             return np.log(found)
 
 
-def check_views(views: Sequence[SeenView], points: _Points | None, findings: list[str]) -> list[str]:
-    """All checks of the views of one sensor, in order, with the sparse points, if there are any.
-
-    Args:
-        findings: What looks wrong is appended, one sentence each.
-    Returns:
-        What was looked at with its numbers, one sentence each.
-    """
+def check_views(views: Sequence[SeenView], points: _Points | None) -> list[Remark]:
+    """What looks wrong with the views of one sensor, and what was measured, with the sparse points, if there are
+    any."""
+    remarks = []
     if len(views) < _FEW_VIEWS:
-        findings.append(
-            f"only {len(views)} views: expect holes and fog; {_FEW_VIEWS} or more all around serve better"
-        )
-    _pixels(views, findings)
+        remarks.append(Remark.of(Code.FEW_VIEWS, views=len(views), enough=_FEW_VIEWS))
+    remarks += _pixels(views)
     if (folding := check_lenses(_cameras(views, [1.0] * len(views)))) is not None:
-        findings.append(folding.sentence())
-    return [
-        check(views, points, findings) for check in (_ring, _overlap, _blur, _exposure, _moving_light, _masks)
-    ]
+        remarks.append(Remark.of(Code.CAPTURE_WARNING, text=folding.sentence()))
+    for check in (_ring, _overlap, _blur, _exposure, _moving_light, _masks):
+        remarks += check(views, points)
+    return remarks
 
 
 def _cameras(views: Sequence[SeenView], scales: Sequence[float]) -> Cameras:
@@ -164,51 +158,48 @@ def angles_between(views: Sequence[SeenView]) -> Float64[np.ndarray, "N N"]:
     return np.degrees(np.arccos(np.clip(axes @ axes.T, -1.0, 1.0)))
 
 
-def _pixels(views: Sequence[SeenView], findings: list[str]) -> None:
-    """Views with many saturated or missing pixels, or without matter."""
-    for what, limit in (("saturated", _SATURATED_SHARE), ("missing", _MISSING_SHARE)):
-        shares = {
-            view.name: getattr(view.record, f"{what}_pixels") / view.record.num_pixels for view in views
-        }
-        many = [f"{name} ({part:.0%})" for name, part in shares.items() if part > limit]
-        _note(findings, many, f"with more than {limit:.0%} {what} pixels")
-    empty = [view.name for view in views if view.record.matter_share == 0.0]
-    _note(findings, empty, "without any matter, by the mask")
+def _pixels(views: Sequence[SeenView]) -> list[Remark]:
+    """Views with many saturated or missing pixels, or without foreground."""
+    remarks = []
+    for code, field, limit in (
+        (Code.VIEWS_SATURATED, "saturated_pixels", _SATURATED_SHARE),
+        (Code.VIEWS_MISSING, "missing_pixels", _MISSING_SHARE),
+    ):
+        shares = {view.name: getattr(view.record, field) / view.record.num_pixels for view in views}
+        many = [f"{name} ({share:.0%})" for name, share in shares.items() if share > limit]
+        remarks += _of_views(code, many, limit=f"{limit:.0%}")
+    return remarks + _of_views(
+        Code.VIEWS_EMPTY, [view.name for view in views if view.record.matter_share == 0.0]
+    )
 
 
-def _note(findings: list[str], names: Sequence[str], what: str) -> None:
-    """A finding that names the views that it is in, if there are any."""
-    if names:
-        findings.append(f"{counted(len(names), 'view')} {what}: {name_some(names, 5)}")
+def _of_views(code: Code, names: Sequence[str], **values: str) -> list[Remark]:
+    """A remark that names the views that it is about, if there are any."""
+    return [Remark.of(code, views=len(names), named=[*names], **values)] if names else []
 
 
-def _ring(views: Sequence[SeenView], _: _Points | None, findings: list[str]) -> str:
+def _ring(views: Sequence[SeenView], _: _Points | None) -> list[Remark]:
     """From which sides the cameras look, and what is missing."""
     poses = np.stack([view.camera.camera_to_world for view in views])
     focus = meeting_point(poses)
     if focus is None:
-        return "the cameras look at no one place: sides are not judged"
+        return [Remark.of(Code.SIDES_UNJUDGED)]
     directions = poses[:, :, 3] - focus
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     elevation = np.degrees(np.arcsin(np.clip(directions[:, 2], -1.0, 1.0)))
     azimuth = np.sort(np.degrees(np.arctan2(directions[:, 1], directions[:, 0])))
     gap = float(np.diff(azimuth, append=azimuth[0] + 360.0).max())
     around, height = 360.0 - gap, float(np.ptp(elevation))
-    said = (
-        f"cameras span {around:.0f} degrees around the middle, at elevations of {elevation.min():.0f} to "
-        f"{elevation.max():.0f} degrees"
-    )
+    ends = {"lowest": f"{elevation.min():.0f}", "highest": f"{elevation.max():.0f}"}
+    remarks = [Remark.of(Code.SIDES, around=f"{around:.0f}", **ends)]
     if height < _NARROW_DEG and around > _WIDE_RING_DEG:
-        findings.append(
-            f"a narrow ring: all cameras are within {height:.0f} degrees of elevation, so that what is seen from "
-            "above or below is a guess; add a second ring 25 degrees higher"
-        )
+        remarks.append(Remark.of(Code.NARROW_RING, height=f"{height:.0f}"))
     if around > _WIDE_RING_DEG and gap > _GAP_DEG:
-        findings.append(f"no camera looks from {gap:.0f} degrees of the circle around the object")
-    return said
+        remarks.append(Remark.of(Code.GAP_IN_RING, gap=f"{gap:.0f}"))
+    return remarks
 
 
-def _overlap(views: Sequence[SeenView], points: _Points | None, findings: list[str]) -> str:
+def _overlap(views: Sequence[SeenView], points: _Points | None) -> list[Remark]:
     """Whether each view shows something that another view shows from a similar side.
 
     A grid of rays of each view is followed to the depth of the middle of the scene: where the cameras look, or that of
@@ -220,7 +211,7 @@ def _overlap(views: Sequence[SeenView], points: _Points | None, findings: list[s
     if focus is None and points is not None and len(points):
         focus = np.median(points, axis=0)
     if focus is None or len(views) < 2:
-        return "overlap is not judged: the cameras look at no one place, and there are no sparse points"
+        return [Remark.of(Code.OVERLAP_UNJUDGED)]
     between = angles_between(views)
     shares = np.zeros(len(views))
     nearest = np.zeros(len(views))
@@ -233,17 +224,14 @@ def _overlap(views: Sequence[SeenView], points: _Points | None, findings: list[s
         seen = [np.isfinite(views[other]._pixels_of(points)).all(axis=1).mean() for other in near]
         shares[index] = max(seen, default=0.0)
     alone = [index for index in range(len(views)) if shares[index] < _LEAST_OVERLAP]
-    said = (
-        f"views share {np.median(shares):.0%} with a neighbour (median; least {shares.min():.0%}); the nearest one "
-        f"looks from {np.median(nearest):.0f} degrees away (median; most {nearest.max():.0f})"
-    )
+    overlap = {"usual": f"{np.median(shares):.0%}", "least": f"{shares.min():.0%}"}
+    angles_away = {"angle": f"{np.median(nearest):.0f}", "most": f"{nearest.max():.0f}"}
     names = [views[index].name for index in alone]
-    best = (
-        f"at most {shares[alone].max(initial=0):.0%}, from {nearest[alone].min(initial=180):.0f} degrees away"
-    )
-    what = f"with hardly any overlap with another one ({best}), take views in smaller steps"
-    _note(findings, names, what)
-    return said
+    best, angle = f"{shares[alone].max(initial=0):.0%}", f"{nearest[alone].min(initial=180):.0f}"
+    return [
+        Remark.of(Code.OVERLAP, **overlap, **angles_away),
+        *_of_views(Code.VIEWS_ALONE, names, share=best, angle=angle),
+    ]
 
 
 def _points_seen(view: SeenView, focus: Float64[np.ndarray, "3"]) -> _Points:
@@ -257,26 +245,25 @@ def _points_seen(view: SeenView, focus: Float64[np.ndarray, "3"]) -> _Points:
     return view.position + depth * rays / (rays @ view.axis)[:, None]
 
 
-def _blur(views: Sequence[SeenView], _: _Points | None, findings: list[str]) -> str:
+def _blur(views: Sequence[SeenView], _: _Points | None) -> list[Remark]:
     """Views with less fine detail than the others."""
     details = np.array([view.record.detail for view in views])
     middle = float(np.median(details))
     if len(views) < _LEAST_VIEWS or middle <= 0:
-        return "blur is not judged"
+        return [Remark.of(Code.BLUR_UNJUDGED)]
     blurred = [
         f"{view.name} ({detail / middle:.0%} of the usual detail)"
         for view, detail in zip(views, details, strict=True)
         if detail < _BLURRED * middle
     ]
-    said = f"finest structures have {middle:.2f} times the contrast of those twice as large (median of views)"
-    _note(findings, blurred, "less sharp than the others")
-    return said
+    detail = Remark.of(Code.DETAIL, detail=f"{middle:.2f}")
+    return [detail, *_of_views(Code.VIEWS_LESS_SHARP, blurred)]
 
 
-def _exposure(views: Sequence[SeenView], points: _Points | None, findings: list[str]) -> str:
+def _exposure(views: Sequence[SeenView], points: _Points | None) -> list[Remark]:
     """Views whose sparse points are brighter or darker than the same points in the views nearest to them."""
     if points is None or len(points) < _LEAST_SHARED_POINTS or len(views) < _LEAST_VIEWS:
-        return "exposure is not compared: it takes sparse points, as of estimated poses and COLMAP"
+        return [Remark.of(Code.BRIGHTNESS_WITHOUT_POINTS)]
     angles = angles_between(views) + 360.0 * np.eye(len(views))
     before = [view._has_before_it(points) for view in views]
     gains = np.full(len(views), np.nan)  # logarithms, against the views around
@@ -291,32 +278,26 @@ def _exposure(views: Sequence[SeenView], points: _Points | None, findings: list[
         if len(ratios) >= 2:
             gains[index] = np.median(ratios)
     if np.isnan(gains).any():
-        return "exposure is not compared: too few sparse points are seen in every view"
+        return [Remark.of(Code.BRIGHTNESS_OF_FEW_POINTS)]
     usual = 1.4826 * float(np.median(np.abs(gains - np.median(gains))))
-    said = f"sparse points vary by {np.expm1(usual):.0%} in brightness from view to view (robust deviation)"
     jumps = [
         f"{view.name} ({np.exp(gain):.2f} times as bright)"
         for view, gain in zip(views, gains, strict=True)
         if abs(gain) > max(_JUMP, _JUMP_DEVIATIONS * usual)
     ]
-    _note(findings, jumps, "with a jump of exposure, judged by sparse points")
-    return said
+    deviation = Remark.of(Code.BRIGHTNESS, deviation=f"{np.expm1(usual):.0%}")
+    return [deviation, *_of_views(Code.VIEWS_JUMP, jumps)]
 
 
-def _moving_light(views: Sequence[SeenView], points: _Points | None, findings: list[str]) -> str:
+def _moving_light(views: Sequence[SeenView], points: _Points | None) -> list[Remark]:
     """Whether the light moves with the camera, as on a turntable."""
     found = _slope_of_light(views, points)
     if found is None:
-        return "whether light moves with the camera is not measured: too few sparse points or near views"
+        return [Remark.of(Code.LIGHT_UNMEASURED)]
     slope, error, pairs = found
-    said = (
-        f"the brightness of sparse points has a slope of {slope:.2f} +- {error:.2f} along the movement of "
-        f"the camera ({pairs} pairs of views; 0 is fixed light)"
-    )
-    if abs(slope) > max(_LEAST_SLOPE, _CERTAINTY * error):
-        moves = "light moves with the camera, as when an object is turned before fixed lamps"
-        findings.append(f"{moves}: {said}. Shading of a point then changes from view to view")
-    return said
+    facts = {"slope": f"{slope:.2f}", "error": f"{error:.2f}", "pairs": pairs}
+    moves = abs(slope) > max(_LEAST_SLOPE, _CERTAINTY * error)
+    return [Remark(code, facts) for code in (Code.LIGHT, *[Code.LIGHT_MOVES] * moves)]
 
 
 def _slope_of_light(views: Sequence[SeenView], points: _Points | None) -> tuple[float, float, int] | None:
@@ -361,14 +342,14 @@ _LONGEST_MASK_PX, _MOST_MASKS = 160, 60
 """Pixels of a mask along its longer side, and masks, that are compared."""
 
 
-def _masks(views: Sequence[SeenView], _: _Points | None, findings: list[str]) -> str:
+def _masks(views: Sequence[SeenView], _: _Points | None) -> list[Remark]:
     """Whether what masks show is there for the other views: a wall that is cut out as backdrop in some views and not
     in others is not."""
     from PIL import Image
 
     some = [views[index] for index in evenly_spaced(len(views), _MOST_MASKS)]
     if len(some) < _LEAST_VIEWS or all(view.record.matter_share == 1.0 for view in some):
-        return "masks are not compared: there are too few views, or none has a mask"
+        return [Remark.of(Code.MASKS_UNCOMPARED)]
     scales = [
         min(1.0, _LONGEST_MASK_PX / max(lens.width, lens.height))
         for lens in (view.camera.lens for view in some)
@@ -383,11 +364,11 @@ def _masks(views: Sequence[SeenView], _: _Points | None, findings: list[str]) ->
             )
         shown.append(np.asarray(opacity) > 127)
     share = contradicted_share(cameras, shown)[1]
+    remarks = [Remark.of(Code.MASKS_COMPARED, share=f"{share:.1%}")]
     if (found := check_masks(share)) is not None:
-        findings.append(
-            found.sentence(
-                "Look at contact-sheet.png: walls or ground may be cut out as a backdrop in parts (--mask none keeps "
-                "everything), or poses are off"
-            )
+        advice = (
+            "Look at contact-sheet.png: walls or ground may be cut out as a backdrop in parts (--mask none keeps "
+            "everything), or poses are off"
         )
-    return f"behind {share:.1%} of what masks show, masks of other views have only background"
+        remarks.append(Remark.of(Code.CAPTURE_WARNING, text=found.sentence(advice)))
+    return remarks

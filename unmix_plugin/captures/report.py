@@ -39,6 +39,10 @@ def _done(template: str) -> tuple[Kind, str]:
     return Kind.DONE, template
 
 
+def _measured(template: str) -> tuple[Kind, str]:
+    return Kind.MEASURED, template
+
+
 def _doubt(template: str) -> tuple[Kind, str]:
     """Of a file: what may make its values, wavelengths or geometry wrong; its sentence begins with names of files."""
     return Kind.WRONG, "{files}" + template
@@ -344,6 +348,95 @@ class Code(Enum):
     )
     NOISY_BANDS_KEPT = _done(
         "{noisy} of {bands} bands have noise above {limit} of their signal; all are kept"
+    )
+
+    # The written scene: places of cameras, pictures, exposure, moving light.
+    FEW_VIEWS = _wrong("only {views} views: expect holes and fog; {enough} or more all around serve better")
+    VIEWS_SATURATED = _wrong("{views:view} with more than {limit} saturated pixels: {named:5}")
+    VIEWS_MISSING = _wrong("{views:view} with more than {limit} missing pixels: {named:5}")
+    VIEWS_EMPTY = _wrong("{views:view} without any foreground, by the mask: {named:5}")
+    SIDES_UNJUDGED = _measured("the cameras look at no one place: sides are not judged")
+    SIDES = _measured(
+        "cameras span {around} degrees around the middle, at elevations of {lowest} to {highest} degrees"
+    )
+    NARROW_RING = _wrong(
+        "a narrow ring: all cameras are within {height} degrees of elevation, so that what is seen from above or below "
+        "is a guess; add a second ring 25 degrees higher"
+    )
+    GAP_IN_RING = _wrong("no camera looks from {gap} degrees of the circle around the object")
+    OVERLAP_UNJUDGED = _measured(
+        "overlap is not judged: the cameras look at no one place, and there are no sparse points"
+    )
+    OVERLAP = _measured(
+        "views share {usual} with a neighbour (median; least {least}); the nearest one looks from {angle} degrees away "
+        "(median; most {most})"
+    )
+    VIEWS_ALONE = _wrong(
+        "{views:view} with hardly any overlap with another one (at most {share}, from {angle} degrees away), take "
+        "views in smaller steps: {named:5}"
+    )
+    BLUR_UNJUDGED = _measured("blur is not judged")
+    DETAIL = _measured(
+        "finest structures have {detail} times the contrast of those twice as large (median of views)"
+    )
+    VIEWS_LESS_SHARP = _wrong("{views:view} less sharp than the others: {named:5}")
+    BRIGHTNESS_WITHOUT_POINTS = _measured(
+        "exposure is not compared: it takes sparse points, as of estimated poses and COLMAP"
+    )
+    BRIGHTNESS_OF_FEW_POINTS = _measured(
+        "exposure is not compared: too few sparse points are seen in every view"
+    )
+    BRIGHTNESS = _measured(
+        "sparse points vary by {deviation} in brightness from view to view (robust deviation)"
+    )
+    VIEWS_JUMP = _wrong("{views:view} with a jump of exposure, judged by sparse points: {named:5}")
+    LIGHT_UNMEASURED = _measured(
+        "whether light moves with the camera is not measured: too few sparse points or near views"
+    )
+    LIGHT = _measured(
+        "the brightness of sparse points has a slope of {slope} +- {error} along the movement of the camera ({pairs} "
+        "pairs of views; 0 is fixed light)"
+    )
+    LIGHT_MOVES = _wrong(
+        "light moves with the camera, as when an object is turned before fixed lamps: the brightness of sparse points "
+        "has a slope of {slope} +- {error} along the movement of the camera ({pairs} pairs of views; 0 is fixed "
+        "light). Shading of a point then changes from view to view"
+    )
+    MASKS_UNCOMPARED = _measured("masks are not compared: there are too few views, or none has a mask")
+    MASKS_COMPARED = _measured("behind {share} of what masks show, masks of other views have only background")
+
+    # The written scene: what contradicts itself in its values.
+    FILES_PARTLY_READ = _wrong(
+        "{files_read:file} of which only a small part was read: {named}. Other parts may hold the spectra: see "
+        "'unmix-process inspect', and choose with --dataset"
+    )
+    BANDS_WIDE = _wrong(
+        "{bands:band} too wide to stand for one wavelength: {named:5}; --drop-bands leaves them out"
+    )
+    EXPOSURE_STEPS = _wrong(
+        "{views:view} brighter or darker than near ones by one factor in all bands, from dark to bright pixels, as "
+        "with other exposures ({pairs}): look for exposure times or gains that the files do not tell"
+    )
+    LEVEL_ADDED = _wrong(
+        "a level seems to be added to all values: their spectra vary in {rank} ways that do not lead to black (by "
+        "{share} of the mean spectrum, {times} times their spread), as light would: look for a dark frame that was not "
+        "taken off, or an offset stored beside the numbers"
+    )
+    BANDS_ODD = _wrong(
+        "{bands:band} off against both neighbours by one factor in all views and materials: {named}: a gain that was "
+        "not applied, or a line of the lamp without a white reference; leave such bands out with --drop-bands"
+    )
+    MASKS_INVERTED = _wrong(
+        "{views:view} whose foreground is black while the background has light and texture ({named:5}): are the masks "
+        "the wrong way round? White is foreground"
+    )
+    MASKS_HOLLOW = _wrong(
+        "{views:view} whose mask takes the border of the picture for foreground and its middle for background "
+        "({named:5}): are the masks the wrong way round? White is foreground"
+    )
+    MASKS_UNLIKE = _wrong(
+        "{views:view} whose mask covers another share of the picture than those of near views: {named:5}; look at "
+        "these masks"
     )
 
     def __init__(self, kind: Kind, template: str) -> None:

@@ -26,8 +26,8 @@ from jaxtyping import Float32, Float64
 
 from unmix_plugin.captures.cube import CaptureView
 from unmix_plugin.captures.options import ProcessOptions
+from unmix_plugin.captures.report import Code, Remark
 from unmix_plugin.captures.writing.view_files import FULL_SCALE, ViewRecord
-from unmix_plugin.errors import counted, name_some
 from unmix_plugin.scenes.reading.cubes import map_array
 
 _MOST_UNREAD, _HEADER_BYTES = 2.5, 20_000
@@ -67,8 +67,8 @@ _OTHER_COVER = 0.3
 """Share of a view by which its mask may differ from those of near views."""
 
 
-def check_files(views: Sequence[CaptureView], options: ProcessOptions, findings: list[str]) -> None:
-    """Append files of which most was not read, and bands that are too wide for one wavelength."""
+def check_files(views: Sequence[CaptureView], options: ProcessOptions) -> list[Remark]:
+    """Files of which most was not read, and bands that are too wide for one wavelength."""
     left: list[str] = []
     wide: dict[float, float] = {}
     for view in views:
@@ -79,15 +79,13 @@ def check_files(views: Sequence[CaptureView], options: ProcessOptions, findings:
         if bands.wavelengths_nm is not None and bands.fwhm_nm is not None:
             pairs = zip(bands.wavelengths_nm, bands.fwhm_nm, strict=True)
             wide |= {nm: width for nm, width in pairs if width > _WIDE_NM}
+    remarks = []
     if left and options.dataset is None and options.layout not in _CHOOSING_LAYOUTS:
-        findings.append(
-            f"{counted(len(left), 'file')} of which only a small part was read: {', '.join(left[:3])}. Other parts may "
-            "hold the spectra: see 'unmix-process inspect', and choose with --dataset"
-        )
+        remarks.append(Remark.of(Code.FILES_PARTLY_READ, files_read=len(left), named=", ".join(left[:3])))
     if wide:
-        named = name_some([f"{nm:g} nm ({width:.0f} nm wide)" for nm, width in wide.items()], 5)
-        said = f"{counted(len(wide), 'band')} too wide to stand for one wavelength: {named}"
-        findings.append(f"{said}; --drop-bands leaves them out")
+        named = [f"{nm:g} nm ({width:.0f} nm wide)" for nm, width in wide.items()]
+        remarks.append(Remark.of(Code.BANDS_WIDE, bands=len(wide), named=named))
+    return remarks
 
 
 @dataclass(frozen=True)
@@ -124,24 +122,20 @@ def check_values(
     samples: Sequence[ViewSample],
     angles_deg: Float64[np.ndarray, "N N"],
     wavelengths_nm: Float64[np.ndarray, " B"],
-    findings: list[str],
-) -> None:
-    """Append what contradicts itself in the views of one sensor, one sentence each.
+) -> list[Remark]:
+    """What contradicts itself in the views of one sensor.
 
     Args:
         angles_deg: Between their axes.
     """
     spectra = np.concatenate([sample.spectra for sample in samples]).astype(np.float64)
-    _exposure_steps(samples, angles_deg, findings)
+    remarks = _exposure_steps(samples, angles_deg)
     if spectra.shape[1] >= _LEAST_BANDS and len(spectra) >= _LEAST_PIXELS:
-        _dark_level(spectra, findings)
-        _odd_bands(spectra, wavelengths_nm, findings)
-    _masks(samples, angles_deg, findings)
+        remarks += [*_dark_level(spectra), *_odd_bands(spectra, wavelengths_nm)]
+    return [*remarks, *_masks(samples, angles_deg)]
 
 
-def _exposure_steps(
-    samples: Sequence[ViewSample], angles_deg: Float64[np.ndarray, "N N"], findings: list[str]
-) -> None:
+def _exposure_steps(samples: Sequence[ViewSample], angles_deg: Float64[np.ndarray, "N N"]) -> list[Remark]:
     """Pairs of near views of which one is brighter by the same factor everywhere."""
     usable = [
         index
@@ -149,7 +143,7 @@ def _exposure_steps(
         if len(sample.spectra) >= _LEAST_PIXELS and np.median(sample.spectra) > _BLACK
     ]
     if len(usable) < 2 or samples[usable[0]].spectra.shape[1] < 3:
-        return
+        return []
     percentiles = {index: np.percentile(samples[index].spectra, _PERCENTILES, axis=0) for index in usable}
     levels = {index: np.log(np.maximum(numbers, 1e-5)) for index, numbers in percentiles.items()}
     steps: dict[tuple[int, int], float] = {}
@@ -162,20 +156,16 @@ def _exposure_steps(
             if step > _STEP and spread < _UNLIKE * step:
                 steps[view, other] = step
     if not steps:
-        return
+        return []
     names = [
         f"{samples[second].record.name} is {np.exp(step):.2f} times as bright as {samples[first].record.name}"
         for (first, second), step in sorted(steps.items(), key=lambda item: -item[1])
     ]
     concerned = {view for pair in steps for view in pair}
-    findings.append(
-        f"{counted(len(concerned), 'view')} brighter or darker than near ones by one factor in all bands, from dark "
-        f"to bright pixels, as with other exposures ({'; '.join(names[:3])}): look for exposure times or gains that "
-        "the files do not tell"
-    )
+    return [Remark.of(Code.EXPOSURE_STEPS, views=len(concerned), pairs="; ".join(names[:3]))]
 
 
-def _dark_level(spectra: Float64[np.ndarray, "P B"], findings: list[str]) -> None:
+def _dark_level(spectra: Float64[np.ndarray, "P B"]) -> list[Remark]:
     """Whether a level is added to all spectra."""
     mean = spectra.mean(axis=0)
     variances, axes = np.linalg.eigh(np.cov(spectra.T))
@@ -192,17 +182,13 @@ def _dark_level(spectra: Float64[np.ndarray, "P B"], findings: list[str]) -> Non
         if away / usual > worst:
             worst, off, rank = away / usual, away / size, count
     if worst < _OFF_FLAT or off < _LEAST_LEVEL:
-        return
-    findings.append(
-        f"a level seems to be added to all values: their spectra vary in {rank} ways that do not lead to black (by "
-        f"{off:.1%} of the mean spectrum, {worst:.0f} times their spread), as light would: "
-        "look for a dark frame that was not taken off, or an offset stored beside the numbers"
-    )
+        return []
+    return [Remark.of(Code.LEVEL_ADDED, rank=rank, share=f"{off:.1%}", times=f"{worst:.0f}")]
 
 
 def _odd_bands(
-    spectra: Float64[np.ndarray, "P B"], wavelengths_nm: Float64[np.ndarray, " B"], findings: list[str]
-) -> None:
+    spectra: Float64[np.ndarray, "P B"], wavelengths_nm: Float64[np.ndarray, " B"]
+) -> list[Remark]:
     """Bands with a gain of their own."""
     logs = np.log(np.maximum(spectra[spectra.mean(axis=1) > np.median(spectra.mean(axis=1))], 1e-5))
     found: dict[int, float] = {}
@@ -218,13 +204,9 @@ def _odd_bands(
         found[band] = float(gains[band])
         logs[:, band] -= gains[band]  # it disturbs what its neighbours are compared with
     if not found:
-        return
+        return []
     named = [f"{wavelengths_nm[band]:g} nm ({np.exp(gain):.2f} times)" for band, gain in found.items()]
-    findings.append(
-        f"{counted(len(found), 'band')} off against both neighbours by one factor in all views and materials: "
-        f"{', '.join(named)}: a gain that was not applied, or a line of the lamp without a white reference; leave such "
-        "bands out with --drop-bands"
-    )
+    return [Remark.of(Code.BANDS_ODD, bands=len(found), named=", ".join(named))]
 
 
 def _excess(
@@ -247,9 +229,7 @@ def _excess(
     return excess
 
 
-def _masks(
-    samples: Sequence[ViewSample], angles_deg: Float64[np.ndarray, "N N"], findings: list[str]
-) -> None:
+def _masks(samples: Sequence[ViewSample], angles_deg: Float64[np.ndarray, "N N"]) -> list[Remark]:
     """Masks that are the wrong way round, or unlike those of near views."""
     records = [sample.record for sample in samples]
     inverted = [
@@ -261,24 +241,19 @@ def _masks(
         and record.background_spread > _TEXTURE
     ]
     hollow = [sample.record.name for sample in samples if sample.is_hollow]
-    wrong, how = inverted, "matter is black while the background has light and texture"
-    if not wrong and 2 * len(hollow) > len(samples):
-        wrong, how = hollow, "mask takes the border of the picture for matter and its middle for background"
-    if wrong:
-        findings.append(
-            f"{counted(len(wrong), 'view')} whose {how} ({name_some(wrong, 5)}): are the masks the wrong way round? "
-            "White is matter"
-        )
+    remarks = []
+    if inverted:
+        remarks.append(Remark.of(Code.MASKS_INVERTED, views=len(inverted), named=inverted))
+    elif 2 * len(hollow) > len(samples):
+        remarks.append(Remark.of(Code.MASKS_HOLLOW, views=len(hollow), named=hollow))
     shares = np.array([record.matter_share for record in records])
     if len(shares) <= _NEIGHBOURS or np.ptp(shares) == 0:
-        return
+        return remarks
     off = []
     for view, share in enumerate(shares):
         near = [other for other in np.argsort(angles_deg[view]) if other != view][:_NEIGHBOURS]
         if abs(share - np.median(shares[near])) > max(_OTHER_COVER, 2 * float(np.ptp(shares[near]))):
             off.append(f"{records[view].name} ({share:.0%}, near ones {np.median(shares[near]):.0%})")
     if off:
-        findings.append(
-            f"{counted(len(off), 'view')} whose mask covers another share of the picture than those of near views: "
-            f"{name_some(off, 5)}; look at these masks"
-        )
+        remarks.append(Remark.of(Code.MASKS_UNLIKE, views=len(off), named=off))
+    return remarks

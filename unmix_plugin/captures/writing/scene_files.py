@@ -105,14 +105,14 @@ def write_scene_files(
     alike = {name for name, sensor in plan.sensors.items() if _has_bands_of(sensor, plan.sensors[greatest])}
     findings = sentences(left_out, Kind.WRONG)
     findings += dict.fromkeys((*sentences(plan.remarks, Kind.WRONG), *posed.poses.warnings))
-    measured = check_views([v for v in seen if v.record.sensor in alike], posed.poses.points, findings)
-    findings += sentences(posed.remarks, Kind.WRONG)
-    check_files(posed.views, options, findings)
+    checked = check_views([v for v in seen if v.record.sensor in alike], posed.poses.points)
+    checked += [*posed.remarks, *check_files(posed.views, options)]
     for name, sensor in plan.sensors.items():
         same = [view for view in seen if view.record.sensor == name]
         samples = [ViewSample.of(view.record, folder) for view in same]
-        check_values(samples, angles_between(same), sensor.centers_nm, findings)
-    measured.append(check_matches(matched, findings))
+        checked += check_values(samples, angles_between(same), sensor.centers_nm)
+    findings += sentences(checked, Kind.WRONG)
+    measured = [*sentences(checked, Kind.MEASURED), check_matches(matched, findings)]
     title = f"{plan.capture.root}: {len(seen)} views, {_sizes_in_words(plan)}"
     done = sentences(left_out, Kind.DONE) + _what_was_done(plan, posed, [view.record for view in seen])
     reasons = {remark.where[0]: remark for remark in left_out}
