@@ -10,6 +10,7 @@ follow the brightness. About 45 minutes on two quiet cores.
 from __future__ import annotations
 
 import json
+import sys
 import tempfile
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -84,10 +85,10 @@ def main(options: Options) -> None:
         place = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="unmix-captures-")))
         scenes = _scenes(options, place)
         if not scenes:
-            _common.require_scenes(options.turntable)
-            raise SystemExit(
-                "of the captures that are asked for, none is given: name Basil's folder (--basil)"
-            )
+            if "turntable" in (options.only or LIMITS):
+                _common.require_scenes(options.turntable)
+            print("Basil is missing: name the folder of its files (--basil)", file=sys.stderr)
+            raise SystemExit(2)
         for name, words in scenes.items():
             _common.publish(
                 report(name, words, options, place), _common.results_folder(options.results, options.quick)

@@ -1,8 +1,10 @@
 """Results that pages cite: each names the clean revision that it was measured at, and what it depends on is known."""
 
+import ast
 import importlib.util
 import json
 import os
+import re
 import subprocess
 import sys
 
@@ -104,6 +106,13 @@ def test_a_benchmark_without_its_scenes_ends_with_2_and_says_what_makes_them(nam
     assert f"python benchmarks/scenes.py --only {WITHOUT_SCENES[name]}" in ended.stderr
 
 
+def test_a_capture_that_was_asked_for_but_not_given_ends_with_2():
+    words = [sys.executable, ROOT / "benchmarks/captures_training.py", "--only", "basil"]
+    ended = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert ended.returncode == 2, ended.stderr
+    assert "Basil is missing: name the folder of its files (--basil)" in ended.stderr
+
+
 def test_a_folder_without_scenes_is_no_result(tmp_path):
     words = [sys.executable, ROOT / "benchmarks/quality.py", "--scenes", tmp_path]
     ended = subprocess.run(words, capture_output=True, text=True, check=False)
@@ -116,3 +125,20 @@ def test_no_benchmark_looks_beside_the_repository():
     assert [
         name for name, text in sources.items() if "REPOSITORY.parent" in text.replace("parent.parent", "")
     ] == []
+
+
+def _asks_for_something(path):
+    """Whether a benchmark has an option without a default."""
+    (options,) = [
+        node
+        for node in ast.parse(path.read_text(encoding="utf-8")).body
+        if isinstance(node, ast.ClassDef) and node.name == "Options"
+    ]
+    return any(isinstance(line, ast.AnnAssign) and line.value is None for line in options.body)
+
+
+def test_make_bench_runs_every_benchmark_that_needs_no_argument():
+    [words] = re.findall(r"patsubst %,benchmarks/%\.py,([^)]*)\)", text_of("Makefile"))
+    left_out, paths = set(words.split()), sorted((ROOT / "benchmarks").glob("[a-z]*.py"))
+    asking = {path.stem for path in paths if _asks_for_something(path)}
+    assert left_out == asking | {"scenes"}
