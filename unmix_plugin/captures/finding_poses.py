@@ -56,7 +56,8 @@ def check_pose_options(options: ProcessOptions, capture: Capture) -> None:
     low, high = _MARKER_SIZES_M
     if options.marker_size is not None and not low <= options.marker_size <= high:
         raise ConfigError(f"--marker-size {options.marker_size:g}: expected metres, {low} to {high:g}")
-    parse_family(options.marker_family)
+    if options.marker_family is not None:
+        parse_family(options.marker_family)
     if (options.angles is None) == (options.poses == TURNTABLE):
         raise ConfigError(f"--poses {TURNTABLE} and --angles go together, such as --angles 0:360:10")
     if options.angles is not None:
