@@ -16,7 +16,7 @@ from unmix_plugin.comparing.places import Amount
 from unmix_plugin.comparing.printed import printed_report
 from unmix_plugin.comparing.shown import ShownView, change_maps, panels, show_view
 from unmix_plugin.engine.sampling import evenly_spaced
-from unmix_plugin.errors import ConfigError
+from unmix_plugin.errors import ConfigError, counted
 from unmix_plugin.figures.pictures import draw_panels, in_rows
 from unmix_plugin.formats.files import array_bytes, csv_bytes, write_file
 from unmix_plugin.formats.meshes import write_ply
@@ -143,7 +143,7 @@ def told(comparison: Comparison) -> list[str]:
     if not places:
         return [*lines, f"nothing has changed, at a level of {comparison.level:g}"]
     lines.append(
-        f"{comparison.changed_area:.2%} of the surface changed, in {len(places)} places; the largest:"
+        f"{comparison.changed_area:.2%} of the surface changed, in {counted(len(places), 'place')}; the largest:"
     )
     for place in places[:5]:
         area = describe_area(place.area, comparison.before.scale)

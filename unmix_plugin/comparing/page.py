@@ -15,6 +15,7 @@ import numpy as np
 from unmix_plugin.comparing.comparison import Comparison
 from unmix_plugin.comparing.printed import amount_said
 from unmix_plugin.comparing.shown import ChangeMap, ShownView, strip
+from unmix_plugin.errors import counted
 from unmix_plugin.figures.pictures import Picture
 from unmix_plugin.formats.files import eight_bits, rgba_png_bytes
 from unmix_plugin.trained.measures import describe_area, describe_scale
@@ -60,7 +61,10 @@ def _script_json(values: Any) -> str:
 def _facts(comparison: Comparison) -> list[tuple[str, str]]:
     found, light = comparison.registration, comparison.registration.light
     return [
-        ("Changed", f"{comparison.changed_area:.2%} of what both see, {len(comparison.places)} places"),
+        (
+            "Changed",
+            f"{comparison.changed_area:.2%} of what both see, {counted(len(comparison.places), 'place')}",
+        ),
         ("Registration", f"{found.rms_px:.2f} pixels rms, {found.overlap:.0%} overlap"),
         ("Light, after over before", f"{np.median(light):.3g} ({light.min():.3g} to {light.max():.3g})"),
         ("Materials", comparison.materials.said()),

@@ -10,6 +10,7 @@ import numpy as np
 from unmix_plugin.comparing.comparison import Comparison
 from unmix_plugin.comparing.shown import ChangeMap, ShownView, panels
 from unmix_plugin.engine.printing import plot_text
+from unmix_plugin.errors import counted
 from unmix_plugin.figures.plotting import page_in_inches
 from unmix_plugin.trained.measures import describe_area, describe_length, describe_scale
 
@@ -51,7 +52,7 @@ def _first_page(comparison: Comparison):  # noqa: ANN202 - a figure of matplotli
         str(comparison.bands),
         comparison.materials.said(),
         describe_scale(comparison.before.scale),
-        f"changed: {comparison.changed_area:.2%} of the surface that both see, {len(comparison.places)} places",
+        f"changed: {comparison.changed_area:.2%} of what both see, {counted(len(comparison.places), 'place')}",
         f"false discoveries: at most {comparison.level:.0%} of the changed vertices",
         *comparison.notes,
     ]
@@ -89,10 +90,15 @@ def amount_said(comparison: Comparison, number: int) -> str:
         amount, scale = place.amounts["distance"], comparison.before.scale
         low, high = (describe_length(value, scale) for value in (amount.low, amount.high))
         return f"{low} to {high}"
+    brightness = place.amounts["brightness"]
+    text = f"{brightness.low:.2f} to {brightness.high:.2f} times as bright"
     names = [name for name in place.amounts if name.startswith("abundance ")]
     name = max(names, key=lambda one: abs(np.nan_to_num(place.amounts[one].mean)))
     amount = place.amounts[name]
-    return f"{name.removeprefix('abundance ')} {amount.low:+.2f} to {amount.high:+.2f}"
+    if not amount.low * amount.high > 0:
+        return text
+    said = f"{name.removeprefix('abundance ')} {amount.low:+.2f} to {amount.high:+.2f}"
+    return f"{text}, {said}" if place.what == "brightness" else said
 
 
 def _view_page(comparison: Comparison, view: ShownView, maps: Sequence[ChangeMap]):  # noqa: ANN202 - the same
