@@ -80,11 +80,11 @@ def test_more_of_a_material_is_found_where_it_is_and_by_how_much(stained, surfac
 
 
 def test_a_dent_is_found_along_the_normal(surface, spot):
-    dented = replace(surface, positions=surface.positions - 3.0 * PIXEL * surface.normals * spot[:, None])
+    dented = replace(surface, positions=surface.positions - 2.0 * PIXEL * surface.normals * spot[:, None])
     found = compare(capture(surface), later(dented))
     assert found.places[0].what == "distance"
-    assert found.places[0].amounts["distance"].mean == pytest.approx(-3.0 * PIXEL, rel=0.25)
-    assert surface.areas[found.changed & spot].sum() > 0.8 * surface.areas[spot].sum()
+    assert found.places[0].amounts["distance"].mean == pytest.approx(-2.0 * PIXEL, rel=0.25)
+    assert surface.areas[found.changed & spot].sum() > 0.6 * surface.areas[spot].sum()
 
 
 def test_tables_say_where_what_and_how_sure(stained):

@@ -345,7 +345,7 @@ def _distances(
     roughness = []
     for one in moments:
         own = np.where(enough, one.mean[:, 0], np.nan)
-        roughness.append(smooth.places(np.abs(smooth.places(own, 4) - own), 3))
+        roughness.append(smooth.places(np.abs(smooth.places(own, 1) - own), 3))
     normals = np.stack([smooth.places(axis, 6) for axis in surface.normals.T], axis=1)
     bent = 1 - np.linalg.norm(normals, axis=1)
     off = smooth.places(np.abs(np.where(enough, moments[0].mean[:, 0], np.nan)), 3)

@@ -21,7 +21,7 @@ _GROWING_P = 0.05
 """p of a neighbour up to which a place goes on."""
 _SMALLEST_PX, _SMALLEST_BY_DISTANCE_PX = 4.0, 100.0
 """Area in pixels below which a place is not told from noise at an edge; and of one that is known by distance alone, as
-errors of distances reach about so far."""
+errors of distances reach about so far, unless the distance is clear: a hundredth of the level."""
 _LARGEST_HOLE_PX = 30.0
 """Area of what lies within a place and belongs to it."""
 _CONFIDENCE = 0.95
@@ -85,10 +85,11 @@ def find_places(
     by_spectra = is_significant(
         adjusted(any_of([differences["spectrum"].p, differences["brightness"].p])), level
     )
+    by_clear_distance = is_significant(differences["distance"].q, level / 100)
     changed = np.zeros(len(p), bool)
     for vertices in _pieces(surface, grown):
         areas = surface.areas[vertices] / pixel**2
-        is_seen = areas[by_spectra[vertices]].sum() >= _SMALLEST_PX
+        is_seen = areas[(by_spectra | by_clear_distance)[vertices]].sum() >= _SMALLEST_PX
         if seeds[vertices].any() and (is_seen or areas.sum() >= _SMALLEST_BY_DISTANCE_PX):
             changed[vertices] = True
     for hole in _pieces(surface, ~changed):
@@ -169,7 +170,7 @@ def _standing_out(
         return 0.0
     weights = areas[vertices][known] + 1e-30
     mean = np.linalg.norm(weights @ means[known] / weights.sum())
-    return float(mean / max(np.sqrt((weights @ errors[known] ** 2 / weights.sum()).mean()), 1e-30))
+    return float(mean / max(np.sqrt((weights @ errors[known] ** 2 / weights.sum()).sum()), 1e-30))
 
 
 def angle_over(means: Sequence[Float64[np.ndarray, "P B"]], vertices: Int64[np.ndarray, " n"]) -> float:

@@ -18,7 +18,7 @@ _WIDTH, _HEIGHT, _MARGIN, _LINE = 8.27, 11.69, 0.7, 0.21
 """A4, inches."""
 _LETTERS = 96
 """In a line."""
-_COLUMNS = (0.0, 0.45, 1.55, 2.6, 4.1, 4.85, 5.6)
+_COLUMNS = (0.0, 0.3, 1.1, 2.25, 3.75, 4.4, 4.9)
 _MOST_ROWS = 30
 
 

@@ -151,6 +151,8 @@ _DEGREES = (2.0, 2.5, 3.0, 4.0, 5.0, 7.0, 10.0, 15.0, 30.0, 100.0)
 """Of freedom that are tried."""
 _INNER, _OUTER = 0.5, 0.95
 """Quantiles of sizes that t is fitted to; what changed is expected beyond."""
+_USUAL_FEATURES = (0.03, 0.97)
+"""Quantiles of each feature of places that are told apart."""
 _LEAST_DISTANCE = 0.005
 """Pixels below which a distance is as good as none."""
 
@@ -165,6 +167,8 @@ def difference_of_heights(
     if known.sum() < 20 * (1 + features.shape[1]):
         return Difference(np.where(known, change, np.nan)[:, None], error[:, None], p, 1.0)
     given = features[known]
+    # What is rare among the places is not extrapolated to: a deep dent is not to explain its own size.
+    given = given.clip(*np.quantile(given, _USUAL_FEATURES, axis=0))
     columns = np.concatenate([np.ones((len(given), 1)), given, given**2], axis=1)
     sizes = np.log(np.abs(change[known]) + _LEAST_DISTANCE)
     solution, *_ = np.linalg.lstsq(columns, sizes, rcond=None)
