@@ -83,7 +83,8 @@ def test_a_dent_is_found_along_the_normal(surface, spot):
     dented = replace(surface, positions=surface.positions - 2.0 * PIXEL * surface.normals * spot[:, None])
     found = compare(capture(surface), later(dented))
     assert found.places[0].what == "distance"
-    assert found.places[0].amounts["distance"].mean == pytest.approx(-2.0 * PIXEL, rel=0.25)
+    # Averaged with the border over four rings of a mesh of 1.6 pixels.
+    assert found.places[0].amounts["distance"].mean == pytest.approx(-2.0 * PIXEL, rel=0.35)
     assert surface.areas[found.changed & spot].sum() > 0.6 * surface.areas[spot].sum()
 
 
