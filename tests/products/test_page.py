@@ -14,7 +14,7 @@ from unmix_plugin.editing.apply import with_sensor
 from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.products.page import page
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
-from unmix_plugin.spectral.sensor import Sensor
+from unmix_plugin.spectral.sensor import SpectralResponses
 
 
 @pytest.fixture(scope="module")
@@ -123,7 +123,7 @@ def test_bands_that_the_light_leaves_dark_are_those_of_the_package():
 def test_through_a_sensor_no_known_spectra_and_no_other_lights_are_offered(tmp_path):
     """They would be taken at the centres of its channels, which see the mean of what is around."""
     responses = np.array([[1.0, 1.0, 0.5, 0.0, 0.0], [0.0, 0.0, 0.5, 1.0, 1.0]])
-    sensor = Sensor("camera", SpectraTable(SCENE.bands, ("short", "long"), responses))
+    sensor = SpectralResponses("camera", SpectraTable(SCENE.bands, ("short", "long"), responses))
     materials = with_sensor(SCENE, sensor).materials
     assert page._known_spectra(materials, ()).sources == []
     assert [one["name"] for one in page._spectral_facts(materials, None)["lights"]] == ["the scene's own"]
