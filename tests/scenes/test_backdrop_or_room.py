@@ -162,6 +162,7 @@ def test_walls_behind_things_are_part_of_the_scene(tmp_path, name):
     assert not scene.has_backdrop
     [decision] = [one for one in scene.decisions if one.subject == "backdrop"]
     assert decision.outcome == "none"
+    assert scene.is_unbounded  # a box would cut the walls off
 
 
 def test_where_views_agree_on_no_place_of_a_backdrop_all_is_kept_and_said(tmp_path):

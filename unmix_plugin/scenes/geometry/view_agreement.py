@@ -63,10 +63,6 @@ _MOST_UNEXPLAINED = 0.3
 """Of a pixel that is explained, against that of unrelated pixels."""
 _MOST_BEHIND = 0.15
 """Of the pixels that speak for one or the other, those that may show something behind a closed box."""
-_MOST_BEHIND_PLAIN = 0.05
-"""The same where plain sides reach the borders of the views: such walls agree at any distance, so that few pixels tell
-of what is behind the box. In rooms of which it holds all 0.02 do, in others 0.07 and more; and an unbounded training of
-such a room costs little where a bounded one cuts its walls off (10 dB)."""
 _LEAST_EXPLAINED = 0.6
 """Of all pixels, those that the inside of a closed box explains: 0.84 in a room, 0.26 in the open."""
 
@@ -282,14 +278,10 @@ class _WorldEvidence:
                 "matched places": self.num_places,
                 "matched places outside": self.num_outside,
             },
-            f"more than {self._most_behind:.0%} of pixels or places behind the box, or its inside explains less than "
+            f"more than {_MOST_BEHIND:.0%} of pixels or places behind the box, or its inside explains less than "
             f"{_LEAST_EXPLAINED:.0%}",
             "--world",
         )
-
-    @property
-    def _most_behind(self) -> float:
-        return _MOST_BEHIND_PLAIN if self.has_plain_sides else _MOST_BEHIND
 
     @property
     def _reasons(self) -> list[tuple[bool, str]]:
@@ -298,12 +290,15 @@ class _WorldEvidence:
         behind = f"{self.num_behind} of {telling} pixels that tell show places behind it"
         explained = f"its inside explains {self.num_explained} of {self.num_pixels} pixels"
         outside = f"{self.num_outside} of {self.num_places} places matched between views lie outside it"
+        plain = "plain surfaces reach the borders of the views, and pixels of such tell little of how far away they are"
         reasons = [
-            (self.num_behind > self._most_behind * telling, behind),
+            (self.num_behind > _MOST_BEHIND * telling, behind),
             (self.num_explained < _LEAST_EXPLAINED * self.num_pixels, explained),
             (self.num_outside > _MOST_BEHIND * self.num_places, outside),
         ]
-        return reasons if self.num_places else reasons[:2]
+        known = reasons if self.num_places else reasons[:2]
+        # Unbounded training of a room that the box holds costs little; bounded, other walls are cut off (6 to 13 dB).
+        return [*known, (True, plain)] if self.has_plain_sides else known
 
 
 def find_world_evidence(box: SceneBox, views: Views) -> _WorldEvidence:
