@@ -42,6 +42,7 @@ TAKES_THE_ORDER = {
 }
 ALLOWED = {
     "captures/layouts/cubes.py": "ListComp",  # sorted at the end
+    "captures/poses/realitycapture.py": "pop",  # of one
     "commands/demo_scene.py": "list",  # whether there are any
     "commands/image.py": "Call",  # each is removed
     "commands/process_inspect.py": "sorted",  # of texts of different numbers
@@ -53,6 +54,7 @@ ALLOWED = {
     "scenes/pixel_block.py": "pop",  # of one
     "scenes/pixel_table.py": "DictComp",  # looked up by key
     "scenes/reading/faults.py": "For",  # only a single one counts
+    "spectral/library/spectral_tables.py": "pop",  # of one
     "viewer/rendering/captures.py": "next",  # of one
 }
 

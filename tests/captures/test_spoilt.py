@@ -137,4 +137,4 @@ def test_the_scale_does_not_follow_one_view(tmp_path):
     centres = ",".join(str(500 + 10 * index) for index in range(BANDS))
     process(root, tmp_path / "scene", wavelengths=centres)
     written = json.loads((tmp_path / "scene" / "transforms.json").read_text())
-    assert written["calibrated_value_of_1"] == pytest.approx(1000.0, rel=0.01)
+    assert written["calibrated_value_of_1"] == pytest.approx(1.02 * 1000.0, rel=0.01)  # with headroom

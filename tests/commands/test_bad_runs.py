@@ -76,7 +76,10 @@ SPOILT = {
     "piped checkpoint": (piped("checkpoints/step-000020.json"), "is no regular file"),
     "piped tensors": (piped("checkpoints/step-000020.safetensors"), "is no regular file"),
     "light beyond numbers": (in_scene("metadata", illuminant=[1e308] * 8), "the number 1e+308"),
-    "world of no size": (in_scene("metadata", pixel_size=1e-300), "a pixel_size above 0"),
+    "world of no size": (
+        in_scene("metadata", pixel_size=1e-300),
+        "Expected `float` > 1e-12 - at `$.pixel_size`",
+    ),
     "circle of links": (lambda path: (path / "notes").symlink_to("notes"), "can't open the run folder"),
     "scene.json cut off": (cut_off("scene.json"), "can't read"),
     "views outside": (in_scene("summary", frames=[f"../{i}" for i in range(8)]), "the name of a frame"),
@@ -84,9 +87,15 @@ SPOILT = {
         in_scene("metadata", grid_resolution=512),
         "grid_resolution",
     ),
-    "grid of gigabytes": (in_scene("metadata", grid_resolution=1290), "a grid_resolution of 8 to 512"),
-    "bands of text": (in_scene("metadata", wavelengths_nm=["red"]), "expected a number"),
-    "root of no kind": (in_scene("summary", root=7), "expected text"),
+    "grid of gigabytes": (
+        in_scene("metadata", grid_resolution=1290),
+        "Expected `int` <= 512 - at `$.grid_resolution`",
+    ),
+    "bands of text": (
+        in_scene("metadata", wavelengths_nm=["red"]),
+        "Expected `float`, got `str` - at `$.wavelengths_nm[0]`",
+    ),
+    "root of no kind": (in_scene("summary", root=7), "Expected `str`, got `int` - at `$.root`"),
 }
 
 

@@ -59,7 +59,7 @@ def export(job: Job, _: Poses) -> list[Path]:
         )
     written = [write_file(path, data) for path, data in files.items()]
     for path in job.follow("copying pictures", pictures):
-        write_file(job.folder / _PICTURES / path.name, read_bounded(path, MOST_TABLE_BYTES))
+        written.append(write_file(job.folder / _PICTURES / path.name, read_bounded(path, MOST_TABLE_BYTES)))
     return written
 
 

@@ -138,8 +138,11 @@ def measure_distance(views: Views, before: BeforeBackdrop) -> BackgroundDistance
 
     from_centre = origins - centre
     radius = float(np.linalg.norm(from_centre, axis=1).max())
+    far = min(differing(directions), differing(places))
+    if not radius > 0:  # cameras at one place see no distance
+        return BackgroundDistance(far, far)
     spheres = [_on_sphere(from_centre, directions, factor * radius) for factor in _RADII]
-    return BackgroundDistance(min(differing(directions), differing(places)), min(map(differing, spheres)))
+    return BackgroundDistance(far, min(map(differing, spheres)))
 
 
 @dataclass(frozen=True)
