@@ -58,8 +58,11 @@ def export(job: Job, _: Poses) -> list[Path]:
             "transforms.json"
         )
     written = [write_file(path, data) for path, data in files.items()]
-    for path in job.follow("copying pictures", pictures):
-        written.append(write_file(job.folder / _PICTURES / path.name, read_bounded(path, MOST_TABLE_BYTES)))
+    copied = job.follow("copying pictures", pictures)
+    written += [
+        write_file(job.folder / _PICTURES / path.name, read_bounded(path, MOST_TABLE_BYTES))
+        for path in copied
+    ]
     return written
 
 
