@@ -5,7 +5,6 @@ It holds all that it shows, and asks for nothing.
 
 from __future__ import annotations
 
-import base64
 import json
 from collections.abc import Sequence
 from typing import Any
@@ -17,7 +16,7 @@ from unmix_plugin.comparing.printed import amount_said
 from unmix_plugin.comparing.shown import ChangeMap, ShownView, strip
 from unmix_plugin.errors import counted
 from unmix_plugin.figures.pictures import Picture
-from unmix_plugin.formats.files import eight_bits, rgba_png_bytes
+from unmix_plugin.formats.html import fill_template, picture_url
 from unmix_plugin.trained.measures import describe_area, describe_scale
 
 _LARGEST_SIDE_PX = 800
@@ -26,15 +25,6 @@ _LARGEST_SIDE_PX = 800
 
 def changes_page(comparison: Comparison, views: Sequence[ShownView], maps: Sequence[ChangeMap]) -> bytes:
     """The bytes of the page."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    environment = Environment(
-        loader=PackageLoader("unmix_plugin.comparing", "."),
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        undefined=StrictUndefined,
-    )
     values = {
         "title": f"What has changed: {comparison.before.name}, {comparison.after.name}",
         "facts": _facts(comparison),
@@ -49,7 +39,8 @@ def changes_page(comparison: Comparison, views: Sequence[ShownView], maps: Seque
         "data": {"views": [_view_data(comparison, view, maps) for view in views]},
     }  # fmt: skip
     values["data"] = _script_json(values["data"])
-    return environment.get_template("changes.html").render(values).encode("utf-8", "backslashreplace")
+    page = fill_template("unmix_plugin.comparing", "changes.html", values)
+    return page.encode("utf-8", "backslashreplace")
 
 
 def _script_json(values: Any) -> str:
@@ -119,12 +110,4 @@ def _view_data(comparison: Comparison, view: ShownView, maps: Sequence[ChangeMap
 
 
 def _png_url(image: Picture) -> str:
-    """An sRGB picture as a URL that holds it."""
-    from PIL import Image
-
-    pixels = Image.fromarray(eight_bits(np.asarray(image)))
-    longest = max(pixels.size)
-    if longest > _LARGEST_SIDE_PX:
-        width, height = (max(1, round(side * _LARGEST_SIDE_PX / longest)) for side in pixels.size)
-        pixels = pixels.resize((width, height), Image.Resampling.LANCZOS)
-    return f"data:image/png;base64,{base64.b64encode(rgba_png_bytes(np.asarray(pixels))).decode()}"
+    return picture_url(np.asarray(image), _LARGEST_SIDE_PX)

@@ -4,7 +4,6 @@ shows: no script, no font, no request."""
 from __future__ import annotations
 
 import base64
-import io
 import json
 import os
 import platform
@@ -27,7 +26,8 @@ from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.errors import ConfigError, RunError, counted
 from unmix_plugin.figures.paint import scale_strip
 from unmix_plugin.figures.plotting import SpectraChart, css_colour, draw_chart
-from unmix_plugin.formats.files import eight_bits, write_file
+from unmix_plugin.formats.files import write_file
+from unmix_plugin.formats.html import fill_template, picture_url
 from unmix_plugin.formats.libraries import library_of
 from unmix_plugin.products.product import Job
 from unmix_plugin.products.regions import measure_regions, measured_surface
@@ -209,32 +209,12 @@ _LARGEST_SIDE_PX = 640
 
 def _render_page(values: Mapping[str, Any]) -> str:
     """The template filled in; text is escaped."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    environment = Environment(
-        loader=PackageLoader("unmix_plugin.products.report", "."),
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        undefined=StrictUndefined,
-    )
-    environment.filters |= {"css": css_colour, "png": _png_url, "svg": _svg_url}
-    return environment.get_template("report.html").render(values)
+    filters = {"css": css_colour, "png": _png_url, "svg": _svg_url}
+    return fill_template("unmix_plugin.products.report", "report.html", values, filters)
 
 
 def _png_url(image: Float[np.ndarray, "H W 3"] | UInt8[np.ndarray, "H W 3"]) -> str:
-    """An sRGB picture, in [0, 1] or 8-bit, as a URL with the picture in it; large ones are shrunk."""
-    from PIL import Image
-
-    is_float = np.issubdtype(image.dtype, np.floating)
-    pixels = Image.fromarray(eight_bits(image) if is_float else image)
-    longest = max(pixels.size)
-    if longest > _LARGEST_SIDE_PX:
-        size = [max(1, round(side * _LARGEST_SIDE_PX / longest)) for side in pixels.size]
-        pixels = pixels.resize((size[0], size[1]), Image.Resampling.LANCZOS)
-    buffer = io.BytesIO()
-    pixels.save(buffer, format="PNG", optimize=True)
-    return f"data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode()}"
+    return picture_url(image, _LARGEST_SIDE_PX)
 
 
 def _svg_url(chart: SpectraChart) -> str:
