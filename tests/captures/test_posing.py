@@ -130,7 +130,7 @@ def test_lenses_that_were_scaled_to_their_pictures_are_said(width, height, note,
 
 def rig_view(release: str, sensor: str, angles: str | None = None) -> CaptureView:
     cube = cube_of(3, 4, **({} if angles is None else {"Camera:RigRelatives": angles}))
-    return CaptureView(f"{release}{sensor}", cube, sensor, lens=SMALL_LENS, release=release)
+    return CaptureView(f"{release}{sensor}", cube, sensor, lens=SMALL_LENS, shot=release)
 
 
 def turned_camera(seed: int) -> PosedCamera:
@@ -176,7 +176,7 @@ def test_views_without_any_help_are_left_out_and_said_and_those_of_no_release_le
     codes = [(note.code, note.values["lens"]) for note in notes]
     assert (Code.RIG_OFFSET_UNKNOWN, "b") in codes
     assert [code for code, _ in codes].count(Code.RIG_WITHOUT_POSE) == 2
-    single = [replace(views[0], name=name, sensor="", release="") for name in ("one", "two")]
+    single = [replace(views[0], name=name, sensor="", shot="") for name in ("one", "two")]
     completed, notes = _complete_rigs(single, {"one": turned_camera(1)})
     assert (set(completed), notes) == ({"one"}, [])
 

@@ -447,8 +447,8 @@ class CaptureView:
     """Opacity in [0, 1], (H, W, 1), where it is not a channel of the picture; the cube is multiplied by it."""
     lens: Lens | None = None
     """Intrinsics that the camera itself writes; poses may bring better ones."""
-    release: str = ""
-    """Name of the shutter release; views of one release were taken at one moment by the lenses of a rig."""
+    shot: str = ""
+    """Name of the shutter release; views of one shot were taken at one moment by the lenses of a rig."""
     split: Literal["train", "eval"] | None = None
     """What the layout says the view is for."""
 

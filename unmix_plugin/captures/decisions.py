@@ -5,9 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-import numpy as np
-from jaxtyping import Float64
-
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.plan import Plan, SensorPlan
 from unmix_plugin.captures.posing import PosedViews
@@ -22,7 +19,19 @@ def decisions_of(
     plan: Plan, posed: PosedViews, left_out: Sequence[Remark], options: ProcessOptions
 ) -> list[Decision]:
     """All decisions, those on single sensors with their names."""
-    decisions = [_of_views(len(posed.views), left_out)]
+    reasons = {remark.where[0]: remark.code.name.removeprefix("VIEW_").lower() for remark in left_out}
+    listed = {name: reasons[name].replace("_", " ") for name in [*reasons][:_MOST_LISTED]}
+    more = {"others": len(reasons) - len(listed)} if len(reasons) > len(listed) else {}
+    used = len(posed.views)
+    decisions = [
+        Decision(
+            "views",
+            f"{used} used, {len(reasons)} left out" if reasons else f"all {used} are used",
+            {**listed, **more},
+            "neighbours that are alike, or more than a quarter of the views",
+            "--keep-view, --leave-out",
+        )
+    ]
     for name, sensor in plan.sensors.items():
         decisions += _of_sensor(f" of {name}" if name else "", sensor, options)
     above = max(
@@ -37,20 +46,18 @@ def decisions_of(
             "--scale",
         )
     )
-    return [*decisions, _of_mask(plan, options), _of_poses(posed, options)]
-
-
-def _of_views(used: int, left_out: Sequence[Remark]) -> Decision:
-    reasons = {remark.where[0]: remark.code.name.removeprefix("VIEW_").lower() for remark in left_out}
-    listed = {name: reasons[name].replace("_", " ") for name in [*reasons][:_MOST_LISTED]}
-    more = {"others": len(reasons) - len(listed)} if len(reasons) > len(listed) else {}
-    return Decision(
-        "views",
-        f"{used} used, {len(reasons)} left out" if reasons else f"all {used} are used",
-        {**listed, **more},
-        "neighbours that are alike, or more than a quarter of the views",
-        "--keep-view, --leave-out",
+    decisions.append(_of_mask(plan, options))
+    is_estimated = not posed.poses.has_world
+    decisions.append(
+        Decision(
+            "poses",
+            f"{'estimated' if is_estimated else 'read'}: {posed.poses.source}",
+            {"views": used},
+            "points shared by views that lie elsewhere by the poses",
+            "--poses" if options.poses is None or not is_estimated else "--poses FILE",
+        )
     )
+    return decisions
 
 
 def _of_sensor(where: str, sensor: SensorPlan, options: ProcessOptions) -> Iterator[Decision]:
@@ -68,10 +75,13 @@ def _of_sensor(where: str, sensor: SensorPlan, options: ProcessOptions) -> Itera
                 against,
                 f"--{key}",
             )
-    exposure = sensor.calibration.exposure
+    exposure, brought = sensor.calibration.exposure, "not compared"
+    if exposure is not None:
+        ends = dict.fromkeys(f"{number:g}" for number in (exposure.min(), exposure.max()))
+        brought = f"all brought to {' to '.join(ends)} s"
     yield Decision(
         f"exposure{where}",
-        "not compared" if exposure is None else f"all brought to {' to '.join(_ends(exposure))} s",
+        brought,
         {},
         "a time, gain or f-number that one file states and another lacks; values that are reflectance already",
     )
@@ -97,10 +107,6 @@ def _of_sensor(where: str, sensor: SensorPlan, options: ProcessOptions) -> Itera
     )
 
 
-def _ends(exposure: Float64[np.ndarray, " b"]) -> list[str]:
-    return list(dict.fromkeys(f"{number:g}" for number in (exposure.min(), exposure.max())))
-
-
 def _of_mask(plan: Plan, options: ProcessOptions) -> Decision:
     backdrops = [recipe.background for recipe in plan.recipes.values()]
     found = [backdrop.in_words for backdrop in backdrops if isinstance(backdrop, Backdrop)]
@@ -113,15 +119,4 @@ def _of_mask(plan: Plan, options: ProcessOptions) -> Decision:
         {"asked": options.mask, **({"backdrop": ", ".join(found)} if found else {})},
         "borders with texture, or that differ between views" if options.mask == "auto" else "",
         "--mask",
-    )
-
-
-def _of_poses(posed: PosedViews, options: ProcessOptions) -> Decision:
-    is_estimated = not posed.poses.has_world
-    return Decision(
-        "poses",
-        f"{'estimated' if is_estimated else 'read'}: {posed.poses.source}",
-        {"views": len(posed.views)},
-        "points shared by views that lie elsewhere by the poses",
-        "--poses" if options.poses is None or not is_estimated else "--poses FILE",
     )

@@ -81,7 +81,7 @@ def marked_poses(plan: Plan, options: ProcessOptions) -> PoseSet:
         lenses[view.sensor] = lens = raster.lens(lens_of_view(view.lens, view))
         if lens.resampled_from is not None:
             raise CaptureError(
-                f"lens {view.sensor}: markers are not followed through it ({lens.said}); expected a lens of k1, k2, "
+                f"lens {view.sensor}: markers are not followed through it ({lens.note}); expected a lens of k1, k2, "
                 "p1, p2: undistort the images first, or give poses with --poses FILE"
             )
     sensor_of = {view.name: view.sensor for view in plan.views}

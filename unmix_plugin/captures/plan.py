@@ -175,8 +175,16 @@ class Plan:
 
     def fingerprint(self, options: ProcessOptions) -> dict[str, Any]:
         """What must be the same for views to be gone on with: options, decisions and input files."""
-        own = ["output_dir", "overwrite", "poses", "marker_size", "marker_family", "known_distance", "angles"]
-        asked = {key: value for key, value in plain_options(options).items() if key not in own}
+        free = [
+            "output_dir",
+            "overwrite",
+            "poses",
+            "marker_size",
+            "marker_family",
+            "known_distance",
+            "angles",
+        ]
+        fixed = {key: value for key, value in plain_options(options).items() if key not in free}
         files = [path for view in self.views for path in input_files(view)] + list(self.option_files)
         stamps = []  # path, size and time of change, which tell quickly whether a file is still the same
         for file in _files_of(files):
@@ -187,7 +195,7 @@ class Plan:
         stated = [view.cube.linear for view in self.views if view.cube.linear is not None]
         return {
             "version": __version__,
-            "options": asked,
+            "options": fixed,
             "decisions": self.decisions,
             "bands": {name: sensor.centers_nm.tolist() for name, sensor in self.sensors.items()},
             "gains": sorted({repr((one.gains.tolist(), one.offsets.tolist())) for one in stated}),
@@ -218,7 +226,7 @@ def make_plan(
     sensors: dict[str, SensorPlan] = {}
     for name, same in by_sensor.items():
         # Views of several sizes are several sensors, and one may show the panel of all.
-        every = [v for v in capture.views if v.sensor == name or not (name and v.release)]
+        every = [v for v in capture.views if v.sensor == name or not (name and v.shot)]
         sensors[name] = plan_sensor(same, options, given, all_views=every, cameras=cameras)
     sensors = with_one_exposure(sensors, {name: same[0].cube for name, same in by_sensor.items()})
     left_out = {name: remark for sensor in sensors.values() for name, remark in sensor.left_out.items()}
@@ -228,10 +236,16 @@ def make_plan(
     usual = [sensor.usual_sample.ravel() for sensor in sensors.values()]
     scale = choose_scale(meanings, np.concatenate(usual), options.scale)
 
-    is_rig = any(view.release for view in views)
+    is_rig = any(view.shot for view in views)
     without = []
     if options.mask in ("auto", "files"):
-        without = [view.name for view in views if not _has_opacity(view, options.mask == "files")]
+        # Files of a view tell its matter: an alpha channel, or its mask where that is asked for.
+        takes_masks = options.mask == "files"
+        without = [
+            view.name
+            for view in views
+            if not (view.alpha or alpha_picture(view) or (takes_masks and view.mask is not None))
+        ]
     names = [view.name for view in views]
     mask, remarks_on_mask = choose_mask(options.mask, names, without, is_rig)
     backgrounds = _backgrounds(mask, sensors, sound, scale.value)
@@ -320,7 +334,14 @@ def plan_sensor(
     bands.require(binning, str(first.path))
     compared = ComparedExposures()
     if model is None:  # a maker's calibration accounts for exposures already
-        compared = compare_exposures(_exposed_files(files, references))
+        exposed = ExposedFiles(
+            files,
+            [white.file for white in references.whites],
+            references.darks_beside(files),
+            is_srgb=first.is_srgb,
+            may_be_reflectance=may_be_reflectance(first, bright_values(files)),
+        )
+        compared = compare_exposures(exposed)
 
     raster = Raster.of(first.shape[0], first.shape[1], options.crop, options.bin_pixels)
     calibration = Calibration(
@@ -343,7 +364,7 @@ def plan_sensor(
     still_kept = np.isin(calibration.bands, bands.kept)
     at_end = values[:, still_kept][saturated[:, still_kept]]
     models = {view.name: radiometric_model(view.cube) for view in views}
-    light = {name: own.irradiance for name, own in models.items() if own and own.irradiance is not None}
+    irradiance = {name: one.irradiance for name, one in models.items() if one and one.irradiance is not None}
     return SensorPlan(
         calibration=replace(calibration, bands=bands.kept, bin_bands=binning),
         bands=bands,
@@ -353,7 +374,7 @@ def plan_sensor(
         is_usual=usual_pixels(pixels.views, still_kept),
         saturated_from=float(np.percentile(at_end, _FEW_PERCENTILE)) if len(at_end) else np.inf,
         lamp=_lamp_of(references, bands, binning),
-        irradiance=light,
+        irradiance=irradiance,
         remarks=(*remarks, *compared.remarks, *found),
         left_out=left_out,
     )
@@ -369,17 +390,6 @@ def _lamp_of(
     lamp = (white.signal / white.reflectance)[bands.kept].astype(np.float32)
     lamp = lamp.reshape(-1, binning).mean(axis=1).astype(np.float64)
     return np.clip(lamp, 0.0, None) / lamp.max()
-
-
-def _exposed_files(files: Sequence[Cube], references: SensorReferences) -> ExposedFiles:
-    """The files of one sensor with their references, to compare exposures."""
-    return ExposedFiles(
-        files,
-        [white.file for white in references.whites],
-        references.darks_beside(files),
-        is_srgb=files[0].is_srgb,
-        may_be_reflectance=may_be_reflectance(files[0], bright_values(files)),
-    )
 
 
 def with_one_exposure(sensors: dict[str, SensorPlan], first: dict[str, Cube]) -> dict[str, SensorPlan]:
@@ -454,11 +464,6 @@ def _colours_of(sensor: SensorPlan, scale: float) -> Float32[np.ndarray, "c 3"]:
     shown = ((sensor.sample / np.float32(scale)) @ to_rgb).max(axis=1)
     white = float(np.percentile(shown, _WHITE_PERCENTILE)) if len(shown) else 0.0
     return to_rgb / np.float32(white) if white > 0 else to_rgb
-
-
-def _has_opacity(view: CaptureView, may_be_mask: bool) -> bool:
-    """Whether files of a view tell its matter: an alpha channel, or its mask where that is asked for."""
-    return bool(view.alpha or alpha_picture(view) or (view.mask is not None and may_be_mask))
 
 
 def _backgrounds(

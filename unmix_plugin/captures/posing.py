@@ -1,6 +1,6 @@
 """The cameras of a capture's views: found, given to views by name and by rig, and placed in the scene's world.
 
-The lenses of a rig get poses from each other: where two have poses in the same releases of the shutter, their offset
+The lenses of a rig get poses from each other: where two have poses in the same shots of the shutter, their offset
 follows from these. Otherwise the rotations that the files give are used, and the lenses are taken to be in one place
 (`RigRelatives`: Euler angles in degrees, R = Rx Ry Rz, from the axes of the lens to those of the reference lens, with
 +x right, +y down, +z forward).
@@ -100,7 +100,7 @@ def given_poses(capture: Capture, where: str | None) -> PoseSet:
 def pose_views(
     views: Sequence[CaptureView], poses: PoseSet, known: KnownDistance | None = None
 ) -> PosedViews:
-    """Give each view its camera, lenses of a rig that of others of their release; views without one are left out.
+    """Give each view its camera, lenses of a rig that of others of their shot; views without one are left out.
     Poses that don't tell metres get them from a distance that is known. Raises CaptureError: fewer than two views have
     a camera, or a lens does not fit its view. Raises ConfigError: the distance does not go with the poses."""
     files = [(view.name, [*view.cube.files, *filter(None, [view.picture])]) for view in views]
@@ -116,13 +116,15 @@ def pose_views(
     fitted = {
         view.name: replace(cameras[view.name], lens=lens_of_view(given[view.name], view)) for view in posed
     }
-    has_many_lenses = len({view.sensor for view in posed if view.release}) > 1
-    own = {view.sensor: view.lens for view in posed if view.lens and view.lens == given[view.name]}
+    has_many_lenses = len({view.sensor for view in posed if view.shot}) > 1
+    of_files = {view.sensor: view.lens for view in posed if view.lens and view.lens == given[view.name]}
     lenses = [
-        Remark.of(Code.LENS_OF_SENSOR, lens=name, text=lens.said) for name, lens in own.items() if lens.said
+        Remark.of(Code.LENS_OF_SENSOR, lens=name, text=lens.note)
+        for name, lens in of_files.items()
+        if lens.note
     ]
-    placed, way, how = _place_poses(replace(poses, cameras=fitted), is_flight=has_many_lenses)
-    metres, keys = poses.metres_per_unit, way.to_json() if poses.has_world else {}
+    placed, to_scene, how = _place_poses(replace(poses, cameras=fitted), is_flight=has_many_lenses)
+    metres, keys = poses.metres_per_unit, to_scene.to_json() if poses.has_world else {}
     if known is not None:
         if metres is not None:
             raise ConfigError(f"--known-distance: {poses.source} gives metres already; leave it out")
@@ -184,16 +186,16 @@ def lens_of_view(lens: Lens | None, view: CaptureView) -> Lens:
 def _complete_rigs(
     views: Sequence[CaptureView], cameras: Mapping[str, PosedCamera]
 ) -> tuple[dict[str, PosedCamera], list[Remark]]:
-    """Cameras by view, also of views that get the pose of another lens of their release, moved by the rig; and what
+    """Cameras by view, also of views that get the pose of another lens of their shot, moved by the rig; and what
     was done with each lens."""
-    releases: dict[str, list[CaptureView]] = defaultdict(list)
+    shots: dict[str, list[CaptureView]] = defaultdict(list)
     for view in views:
-        if view.release:
-            releases[view.release].append(view)
-    measured = _measured_offsets(releases, cameras)
+        if view.shot:
+            shots[view.shot].append(view)
+    measured = _measured_offsets(shots, cameras)
     lenses = {view.sensor: cameras[view.name].lens for view in views if view.name in cameras}
     completed, how = dict(cameras), Counter[tuple[str, Code]]()
-    for members in releases.values():
+    for members in shots.values():
         posed = [view for view in members if view.name in cameras]
         for view in members:
             if view.name in cameras:
@@ -213,14 +215,14 @@ def _complete_rigs(
 
 
 def _measured_offsets(
-    releases: Mapping[str, Sequence[CaptureView]], cameras: Mapping[str, PosedCamera]
+    shots: Mapping[str, Sequence[CaptureView]], cameras: Mapping[str, PosedCamera]
 ) -> dict[tuple[str, str], _Pose]:
     """From the camera space of a second lens to that of a first, by the names of both, where both have poses in one
-    release: mean rotation, median place."""
+    shot: mean rotation, median place."""
     from scipy.spatial.transform import Rotation
 
     found: dict[tuple[str, str], list[_Pose]] = defaultdict(list)
-    for members in releases.values():
+    for members in shots.values():
         posed = [view for view in members if view.name in cameras]
         poses = {view.sensor: _square(cameras[view.name].camera_to_world) for view in posed}
         for first, second in permutations(poses, 2):
@@ -255,7 +257,12 @@ def _place_poses(poses: PoseSet, is_flight: bool = False) -> tuple[PoseSet, Plac
     flight, cameras that all look one way look down."""
     stacked = np.stack([camera.camera_to_world for camera in poses.cameras.values()])
     up, how_up = _find_up(stacked, poses.up, is_flight)
-    middle, how_middle = _find_middle(stacked, poses.points)
+    middle, how_middle = stacked[:, :, 3].mean(axis=0), Code.MIDDLE_OF_CAMERAS
+    nearest, points = focus_point(stacked), poses.points
+    if meeting_point(stacked) is None and points is not None and len(points) > 0:
+        middle, how_middle = np.median(points, axis=0), Code.MIDDLE_OF_POINTS
+    elif nearest is not None:
+        middle, how_middle = nearest, Code.MIDDLE_OF_AXES
     reach = float(np.linalg.norm(stacked[:, :, 3] - middle, axis=1).max())
     scale = 1.0 / reach if reach > 0 else 1.0
     rotation = _turn_to_z(up)
@@ -285,17 +292,6 @@ def _find_up(
     return np.array([0.0, 0.0, 1.0]), Code.UP_UNKNOWN
 
 
-def _find_middle(
-    poses: Float64[np.ndarray, "N 3 4"], points: Float64[np.ndarray, "P 3"] | None
-) -> tuple[Float64[np.ndarray, "3"], Code]:
-    met, nearest = meeting_point(poses), focus_point(poses)
-    if met is None and points is not None and len(points) > 0:
-        return np.median(points, axis=0), Code.MIDDLE_OF_POINTS
-    if nearest is not None:
-        return nearest, Code.MIDDLE_OF_AXES
-    return poses[:, :, 3].mean(axis=0), Code.MIDDLE_OF_CAMERAS
-
-
 def _turn_to_z(up: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
     """The smallest rotation that takes a unit vector to +z."""
     axis, cosine = np.cross(up, (0.0, 0.0, 1.0)), float(up[2])
@@ -319,7 +315,23 @@ def asked_distance(options: ProcessOptions, views: Sequence[CaptureView]) -> Kno
     if not low <= metres <= high:
         raise ConfigError(f"{_FLAG}: the distance is {metres:g}; expected metres, {low:g} to {high:g}")
     sizes = {view.name: (view.cube.shape[1], view.cube.shape[0]) for view in views}
-    seen = [_parse_pixel(text, sizes) for text in texts]
+    seen: list[tuple[str, tuple[float, float]]] = []
+    for text in texts:
+        match = re.fullmatch(r"(.+):\s*(-?\d+(?:\.\d*)?)\s*,\s*(-?\d+(?:\.\d*)?)\s*", text)
+        if match is None:
+            raise ConfigError(
+                f"{_FLAG}: {text!r} is no pixel; expected VIEW:column,row, such as view_03:120,80"
+            )
+        name, column, row = match[1], float(match[2]), float(match[3])
+        if name not in sizes:
+            hint = did_you_mean(name, sizes, likeness=0.4, form=" ({})")
+            raise ConfigError(f"{_FLAG} {text}: no view {name!r}{hint}; expected such as {next(iter(sizes))}")
+        right, bottom = (size - 1 for size in sizes[name])
+        if not (0 <= column <= right and 0 <= row <= bottom):
+            raise ConfigError(
+                f"{_FLAG} {text}: outside the view; expected columns 0 to {right}, rows 0 to {bottom}"
+            )
+        seen.append((name, (column + 0.5, row + 0.5)))
     first, second = dict(seen[:2]), dict(seen[2:])
     for number, point in enumerate((first, second), 1):
         if len(point) < 2:
@@ -327,26 +339,10 @@ def asked_distance(options: ProcessOptions, views: Sequence[CaptureView]) -> Kno
     return first, second, metres
 
 
-def _parse_pixel(text: str, sizes: Mapping[str, tuple[int, int]]) -> tuple[str, tuple[float, float]]:
-    match = re.fullmatch(r"(.+):\s*(-?\d+(?:\.\d*)?)\s*,\s*(-?\d+(?:\.\d*)?)\s*", text)
-    if match is None:
-        raise ConfigError(f"{_FLAG}: {text!r} is no pixel; expected VIEW:column,row, such as view_03:120,80")
-    name, column, row = match[1], float(match[2]), float(match[3])
-    if name not in sizes:
-        hint = did_you_mean(name, sizes, likeness=0.4, form=" ({})")
-        raise ConfigError(f"{_FLAG} {text}: no view {name!r}{hint}; expected such as {next(iter(sizes))}")
-    right, bottom = (size - 1 for size in sizes[name])
-    if not (0 <= column <= right and 0 <= row <= bottom):
-        raise ConfigError(
-            f"{_FLAG} {text}: outside the view; expected columns 0 to {right}, rows 0 to {bottom}"
-        )
-    return name, (column + 0.5, row + 0.5)
-
-
 def _metres_per_unit(known: KnownDistance, cameras: Mapping[str, PosedCamera]) -> tuple[float, Remark]:
     """Metres in a unit of the world that cameras with lenses stand in, and how sure that is. Raises ConfigError: a
     view has no pose, the pixels of a point are not those of one, or the points are the same."""
-    ends = np.stack([_meet(number, point, cameras) for number, point in enumerate(known[:2], 1)])
+    ends = np.stack([_triangulate(number, point, cameras) for number, point in enumerate(known[:2], 1)])
     shown = [cameras[name].pixels_of(ends) for point in known[:2] for name in point]
     apart = float(np.nanmax([np.linalg.norm(pixels[1] - pixels[0]) for pixels in shown]))
     if not apart > _LEAST_APART_PX:
@@ -359,7 +355,7 @@ def _metres_per_unit(known: KnownDistance, cameras: Mapping[str, PosedCamera]) -
     return known[2] / float(np.linalg.norm(ends[1] - ends[0])), remark
 
 
-def _meet(number: int, point: _Seen, cameras: Mapping[str, PosedCamera]) -> Float64[np.ndarray, "3"]:
+def _triangulate(number: int, point: _Seen, cameras: Mapping[str, PosedCamera]) -> Float64[np.ndarray, "3"]:
     """Where the two rays of a point meet."""
     where, seen, rays = f"{_FLAG}: point {number}, views {' and '.join(point)}", [], []
     limit = _MOST_MISS_PX
@@ -380,12 +376,13 @@ def _meet(number: int, point: _Seen, cameras: Mapping[str, PosedCamera]) -> Floa
             f"{where}: its rays are nearly parallel ({angle:.2f} degrees between them); expected "
             f"{_LEAST_MEETING_DEG:g} or more: choose views that are farther apart"
         )
-    met = where_rays_meet(seen)
-    assert met is not None  # both lenses were followed
-    miss = float(np.max(met[1]))
+    meeting = where_rays_meet(seen)
+    assert meeting is not None  # both lenses were followed
+    places, misses = meeting
+    miss = float(np.max(misses))
     if not miss <= limit:
         far = "meet behind a camera" if math.isnan(miss) else f"miss each other by {miss:.1f} px"
         raise ConfigError(
             f"{where}: its rays {far}; expected at most {limit:.1f} px: is it one point, and do the poses fit?"
         )
-    return met[0][0]
+    return places[0]

@@ -165,7 +165,7 @@ def _write_views(
                 folder.note(record)
         if record is not None:
             records[view.name] = record
-    return records, _said_of_unreadable(unreadable.found)
+    return records, _unreadable_remarks(unreadable.found)
 
 
 def _without(views: Iterable[CaptureView], left_out: Collection[str]) -> list[CaptureView]:
@@ -183,19 +183,19 @@ def _wanted_views(capture: Capture, options: ProcessOptions) -> tuple[list[Captu
                 raise ConfigError(
                     f"{flag} {name}: no view of this name; there are {name_some(names, 5)}{hint}"
                 )
-    left_out = _said_of_unreadable(capture.unreadable)
+    left_out = _unreadable_remarks(capture.unreadable)
     unreadable = UnreadableViews(len(names))
     wanted = _without(capture.views, options.leave_out)
     for view in wanted:
         with unreadable.noted(view.name):
             for row in sorted({0, view.cube.shape[0] // 2, view.cube.shape[0] - 1}):
                 view.cube.read(slice(row, row + 1))
-    left_out |= _said_of_unreadable(unreadable.found)
+    left_out |= _unreadable_remarks(unreadable.found)
     left_out |= {name: Remark.of(Code.VIEW_NOT_WANTED, [name]) for name in options.leave_out}
     return _without(wanted, left_out), left_out
 
 
-def _said_of_unreadable(found: Iterable[tuple[str, str]]) -> dict[str, Remark]:
+def _unreadable_remarks(found: Iterable[tuple[str, str]]) -> dict[str, Remark]:
     return {name: Remark.of(Code.VIEW_UNREADABLE, [name], why=why) for name, why in found}
 
 
@@ -208,10 +208,12 @@ def _blurred(
     """Views that are blurred, among those of which nothing else is `known`."""
     found: dict[str, Remark] = {}
     for sensor in plan.sensors:
-        own = {
-            name: one for name, one in records.items() if one.sensor == sensor and name not in plan.left_out
+        sharpness = {
+            name: record.sharpness
+            for name, record in records.items()
+            if record.sensor == sensor and name not in plan.left_out
         }
-        found |= judge_sharpness({name: one.sharpness for name, one in own.items()}, cameras)
+        found |= judge_sharpness(sharpness, cameras)
     return {name: remark for name, remark in found.items() if name not in known}
 
 
@@ -267,7 +269,25 @@ def _open_capture(options: ProcessOptions, references: GivenReferences) -> Captu
         named += (Path(options.poses), options.data / options.poses)
     mosaic = parse_mosaic(options.mosaic)
     asked = ReadOptions(options.dataset, wavelengths, options.axes, mosaic=mosaic, exclude=named)
-    capture = _by_size(find_views(options.layout, options.data, asked))
+    capture = find_views(options.layout, options.data, asked)
+
+    # Views of one camera in several sizes, upright and across, are views of several sensors.
+    sizes: dict[tuple[str, int], set[tuple[int, int]]] = defaultdict(set)
+    for view in capture.views:
+        sizes[view.sensor, view.cube.shape[2]].add(view.cube.shape[:2])
+    if any(len(of_camera) > 1 for of_camera in sizes.values()):
+        views = [
+            replace(view, sensor=f"{view.sensor} {view.cube.shape[1]}x{view.cube.shape[0]}".strip())
+            if len(sizes[view.sensor, view.cube.shape[2]]) > 1
+            else view
+            for view in capture.views
+        ]
+        listed = sorted({f"{view.cube.shape[1]} x {view.cube.shape[0]}" for view in capture.views})
+        note = (
+            f"views have {len(listed)} sizes ({name_some(listed)}, width x height), each a sensor of its own"
+        )
+        capture = replace(capture, views=tuple(views), notes=(*capture.notes, note))
+
     if options.mask == "files":
         capture = with_mask_files(capture)
     first: dict[str, Cube] = {}
@@ -292,24 +312,6 @@ def _paths_read(options: ProcessOptions) -> list[tuple[str, Path]]:
     if options.poses is not None:
         named.append(("--poses", options.data / options.poses))
     return [(flag, path) for flag, path in named if path is not None and os.path.lexists(path)]
-
-
-def _by_size(capture: Capture) -> Capture:
-    """Views of one camera in several sizes, upright and across, as views of several sensors."""
-    sizes: dict[tuple[str, int], set[tuple[int, int]]] = defaultdict(set)
-    for view in capture.views:
-        sizes[view.sensor, view.cube.shape[2]].add(view.cube.shape[:2])
-    if all(len(found) == 1 for found in sizes.values()):
-        return capture
-    views = [
-        replace(view, sensor=f"{view.sensor} {view.cube.shape[1]}x{view.cube.shape[0]}".strip())
-        if len(sizes[view.sensor, view.cube.shape[2]]) > 1
-        else view
-        for view in capture.views
-    ]
-    listed = sorted({f"{view.cube.shape[1]} x {view.cube.shape[0]}" for view in capture.views})
-    note = f"views have {len(listed)} sizes ({name_some(listed)}, width x height), each a sensor of its own"
-    return replace(capture, views=tuple(views), notes=(*capture.notes, note))
 
 
 def _open_references(options: ProcessOptions) -> GivenReferences:

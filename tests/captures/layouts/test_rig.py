@@ -72,7 +72,7 @@ def test_every_file_is_a_view_of_its_lens_and_release(flight):
     capture = find_rig(flight, PLAIN)
     assert len(capture.views) == 32
     assert {view.sensor for view in capture.views} == {"green", "red", "rededge", "nir"}
-    releases = {(view.release, view.name.split("_")[-2]) for view in capture.views}
+    releases = {(view.shot, view.name.split("_")[-2]) for view in capture.views}
     assert len(releases) == len({release for release, _ in releases}) == 8
     assert any("1 colour picture left out" in note for note in capture.notes)
 
@@ -184,7 +184,7 @@ def rig_of(folder, files, size=(4, 5)):
 )
 def test_names_and_identifiers_of_makers_tell_releases(tmp_path, files, releases):
     views = rig_of(tmp_path, {name: (500, tags) for name, tags in files.items()}).views
-    assert [view.release for view in views] == releases
+    assert [view.shot for view in views] == releases
 
 
 def test_a_file_without_the_calibration_that_others_of_its_lens_have_is_refused(tmp_path):
@@ -304,7 +304,7 @@ BENT_DJI |= {"focal": (2200.5, 2199.5), "center": (640.0 - 4.25 + 0.5, 480.0 + 7
 def test_a_lens_of_tags_sees_what_formulas_of_their_makers_say(tags, exif, expected):
     lens = present(lens_of(file_with(tags, exif))[0])
     assert worst_px(lens, by_hand(GRID, **expected)) < 0.1
-    assert lens.said == ""
+    assert lens.note == ""
 
 
 def test_a_picture_that_dji_has_dewarped_has_no_distortion():
@@ -312,7 +312,7 @@ def test_a_picture_that_dji_has_dewarped_has_no_distortion():
         lens = present(lens_of(file_with(DJI | {"drone-dji:DewarpFlag": flag}, {}))[0])
         assert (*lens.distortion, lens.higher_radial[0]) == terms
         assert (lens.focal_px, lens.center_px) == ((2200.5, 2199.5), (636.25, 488.0))
-        assert ("DewarpFlag 1" in lens.said) == (flag == "1")
+        assert ("DewarpFlag 1" in lens.note) == (flag == "1")
 
 
 def test_a_fisheye_becomes_the_nearest_lens_and_pixels_are_brought_into_it():
@@ -327,7 +327,7 @@ def test_a_fisheye_becomes_the_nearest_lens_and_pixels_are_brought_into_it():
     assert 0.3 < worst < 4.0
     assert lens.resampled_from is not None
     np.testing.assert_allclose(lens.resampled_from(GRID), expected, atol=0.01)
-    said = float(lens.said.split("nearer than ")[1].split()[0])
+    said = float(lens.note.split("nearer than ")[1].split()[0])
     assert said == pytest.approx(worst, rel=0.3)
 
 

@@ -144,7 +144,7 @@ def test_frames_of_a_scene_folder_have_bands_sensor_and_shot_of_their_own(tmp_pa
     for view, nm in zip(capture.views, expected, strict=True):
         check_file(view.cube, nm=nm, fwhm=None)
     assert [view.sensor for view in capture.views] == ["bands 1", "bands 1", "bands 2", "wide", "wide"]
-    assert [view.release for view in capture.views] == ["", "", "", "shot 1", "shot 1"]
+    assert [view.shot for view in capture.views] == ["", "", "", "shot 1", "shot 1"]
     assert any("'fwhm' has 0 or null for 1 of 4 bands" in text for text in capture.warnings)
     scene = scene_of(tmp_path, scale=1.0)
     for index, bands in enumerate(order):

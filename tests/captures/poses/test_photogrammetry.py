@@ -98,7 +98,7 @@ USUAL = {"focal": (500, 500), "center": (323, 236)}
 )
 def test_metashapes_lenses_see_what_its_manuals_say(tmp_path, written, lens, note):
     found = read_metashape(tmp_path, ring(), **written)
-    atol = 0.1 if lens_of(found).said else 1e-9
+    atol = 0.1 if lens_of(found).note else 1e-9
     np.testing.assert_allclose(pixels_in_file(found, IDEAL), by_hand(IDEAL, **lens), atol=atol)
     assert any(note in said for said in found.notes) == bool(note)
 

@@ -62,9 +62,9 @@ def whole(values: np.ndarray, missing: np.ndarray | None = None, saturated: np.n
 @pytest.mark.parametrize("name", LENSES)
 def test_points_are_seen_where_the_scenes_lens_says(name: str):
     lens = fitted(name)
-    assert lens.resampled_from is not None, lens.said
-    assert "interpolated" in lens.said
-    assert "170" not in name or "% of the picture lies outside and is left out" in lens.said
+    assert lens.resampled_from is not None, lens.note
+    assert "interpolated" in lens.note
+    assert "170" not in name or "% of the picture lies outside and is left out" in lens.note
     columns, rows = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
     places = np.stack([columns, rows], axis=-1).astype(np.float32)  # each pixel tells where it is in the file
     resampling = Resampling.into(lens)
@@ -171,4 +171,4 @@ def test_views_of_one_lens_share_their_resampling_and_a_lens_that_ours_stands_fo
     project, focal = fisheye(60.0)
     lens = fit_lens(project, Lens(WIDTH, HEIGHT, (focal, focal), (64.0, 48.0)), "fisheye", "a file")
     assert lens.resampled_from is None
-    assert "off by at most" in lens.said
+    assert "off by at most" in lens.note

@@ -73,7 +73,7 @@ class ExposedFiles:
         return len({tuple(one) for one in self.known}) > 1 or any(len(one) > 1 for one in self.known)
 
     @property
-    def said(self) -> dict[str, str]:
+    def range_and_unit(self) -> dict[str, str]:
         """The exposures of the views, for sentences."""
         return {"exposed": _range(self.known), "unit": _unit(self.stating)}
 
@@ -97,7 +97,7 @@ def compare_exposures(files: ExposedFiles) -> ComparedExposures:
     """What the views are brought to, and what may be wrong with that."""
     finished = [finished_by(file, by_name=not files.whites) for file in files.views]
     if None not in finished and not files.is_srgb:
-        kept = Remark.of(Code.EXPOSURE_COUNTED_BEFORE, **files.said, source=finished[0])
+        kept = Remark.of(Code.EXPOSURE_COUNTED_BEFORE, **files.range_and_unit, source=finished[0])
         return ComparedExposures(None, (kept,) if files.differ else ())
     misfits = _misfits(files)
     doubts = [*_missing_units((*files.views, *files.whites)), *misfits]
@@ -105,16 +105,25 @@ def compare_exposures(files: ExposedFiles) -> ComparedExposures:
     if why is not None:
         return ComparedExposures(None, (*doubts, *why))
     if files.known and len(files.of_whites) < len(files.whites) and not misfits:
-        doubts.append(Remark.of(Code.WHITE_EXPOSURE_UNKNOWN, **files.said))
+        doubts.append(Remark.of(Code.WHITE_EXPOSURE_UNKNOWN, **files.range_and_unit))
     if lacking := files.lacking("gain"):
         doubts.append(Remark.of(Code.GAIN_TAKEN_AS_ONE, lacking=[file.path.name for file in lacking]))
-    doubts += _unlike_darks(files.darks)
+
+    # A dark frame should be exposed as what it is subtracted from.
+    pairs = [(exposure_of(dark, False), exposure_of(other, False)) for dark, other in files.darks]
+    unlike = [(a, b) for a, b in pairs if a is not None and b is not None and not np.array_equal(a, b)]
+    if unlike:
+        of_darks, of_others = (_range(exposures) for exposures in zip(*unlike, strict=True))
+        unit = _unit([file for pair in files.darks for file in pair], to_light=False)
+        facts = {"of_dark": of_darks, "of_others": of_others, "unit": unit}
+        doubts.append(Remark.of(Code.DARK_EXPOSED_OTHERWISE, **facts))
+
     common, of_whom = np.median(files.known[0], keepdims=True), "the first view"
     if files.of_whites:
         common, of_whom = files.of_whites[0], f"{'the' if len(files.whites) == 1 else 'its'} white reference"
     if len({tuple(exposure) for exposure in [*files.known, *files.of_whites, common]}) > 1:
         to = _range(files.of_whites or [common])
-        doubts.append(Remark.of(Code.EXPOSURES_EVENED, **files.said, whose=of_whom, common=to))
+        doubts.append(Remark.of(Code.EXPOSURES_EVENED, **files.range_and_unit, whose=of_whom, common=to))
     return ComparedExposures(common, tuple(doubts))
 
 
@@ -132,21 +141,10 @@ def _why_not(files: ExposedFiles, has_misfits: bool) -> list[Remark] | None:
             names = [file.path.name for file in lacking]
             return [Remark.of(Code.EXPOSURE_FACTOR_UNKNOWN, factor=name, lacking=names)]
     if files.is_srgb:
-        return [Remark.of(Code.EXPOSURES_OF_PICTURES, **files.said)] if files.differ else []
+        return [Remark.of(Code.EXPOSURES_OF_PICTURES, **files.range_and_unit)] if files.differ else []
     if files.may_be_reflectance and files.differ and not (files.whites or files.darks):
-        return [Remark.of(Code.EXPOSURES_OF_REFLECTANCES, **files.said)]
+        return [Remark.of(Code.EXPOSURES_OF_REFLECTANCES, **files.range_and_unit)]
     return None
-
-
-def _unlike_darks(darks: Sequence[tuple[Cube, Cube]]) -> list[Remark]:
-    """A warning of dark frames that were exposed otherwise than what they are subtracted from."""
-    pairs = [(exposure_of(dark, False), exposure_of(other, False)) for dark, other in darks]
-    unlike = [(a, b) for a, b in pairs if a is not None and b is not None and not np.array_equal(a, b)]
-    if not unlike:
-        return []
-    of_darks, of_others = (_range(exposures) for exposures in zip(*unlike, strict=True))
-    unit = _unit([file for pair in darks for file in pair], to_light=False)
-    return [Remark.of(Code.DARK_EXPOSED_OTHERWISE, of_dark=of_darks, of_others=of_others, unit=unit)]
 
 
 def _unit(files: Sequence[Cube], to_light: bool = True) -> str:

@@ -98,7 +98,10 @@ def calibrate_image(
     saturated = rows.saturated.any(axis=-1)
     remarks += compared.remarks if references.whites else []
     warnings = [*_doubts(file, references), *sentences(remarks, Kind.WRONG)]
-    notes = [*_used(references), *sentences(remarks, Kind.DONE)]
+    used = next(iter(references.own.values()), references.common)
+    named = (("dark frame", used.dark), ("white reference", used.white))
+    notes = [f"{kind} {one.file.path.name}: {one.how}" for kind, one in named if one]
+    notes += sentences(remarks, Kind.DONE)
     notes += (
         [f"{counted(unlit, 'band')} without light on the white, or saturated there, left out"]
         if unlit
@@ -136,12 +139,6 @@ def _good_bands(file: Cube, lit: np.ndarray) -> np.ndarray:
         find_missing(file.read(every, kept[[i]]), file, every, kept[[i]]).all() for i in range(len(kept))
     ]
     return kept if all(lacking) else kept[~np.array(lacking)]
-
-
-def _used(references: SensorReferences) -> list[str]:
-    used = next(iter(references.own.values()), references.common)
-    named = [(kind, one) for kind, one in (("dark frame", used.dark), ("white reference", used.white)) if one]
-    return [f"{kind} {one.file.path.name}: {one.how}" for kind, one in named]
 
 
 def _doubts(file: Cube, references: SensorReferences) -> list[str]:

@@ -392,7 +392,16 @@ def find_references(
     dark = None if given.dark is None else open_reference(given.dark, ReferenceKind.DARK, cube)
     panel = None
     if options.white_rectangle is not None:
-        panel = _panel_in_view(all_views, *options.white_rectangle, is_dark_given=dark is not None)
+        wanted, *rectangle = options.white_rectangle
+        shown = next((view for view in all_views if wanted in (view.name, view.shot)), None)
+        if shown is None:
+            names = name_some([view.name for view in all_views], 5)
+            raise ConfigError(f"--white-rectangle {wanted}: no view of this name; there are {names}")
+        top, left, height, width = rectangle
+        panel = panel_reference(shown.cube, (top, left, height, width), shown.name)
+        own_dark = _own_dark(shown.cube, shown.dark) if dark is None else None
+        if own_dark is not None:
+            panel = replace(panel, dark=open_reference(own_dark, ReferenceKind.DARK, shown.cube))
     elif given.white is not None:
         panel = _open_white(given.white, _own_dark(given.white) if dark is None else None, cube)
     white = panel and _as_white(panel, dark, options.white_reflectance, wavelengths_nm)
@@ -436,26 +445,6 @@ def _own_references(
             opened[key] = ViewReferences(dark, white)
         own[view.cube.path] = opened[key]
     return own
-
-
-def _panel_in_view(
-    views: Sequence[CaptureView],
-    wanted: str,
-    top: int,
-    left: int,
-    height: int,
-    width: int,
-    *,
-    is_dark_given: bool,
-) -> Reference:
-    """The panel in the view, or the release of a rig, of this name, with the dark frame of that view."""
-    view = next((view for view in views if wanted in (view.name, view.release)), None)
-    if view is None:
-        names = name_some([view.name for view in views], 5)
-        raise ConfigError(f"--white-rectangle {wanted}: no view of this name; there are {names}")
-    panel = panel_reference(view.cube, (top, left, height, width), view.name)
-    dark = None if is_dark_given else _own_dark(view.cube, view.dark)
-    return panel if dark is None else replace(panel, dark=open_reference(dark, ReferenceKind.DARK, view.cube))
 
 
 def _own_dark(file: Cube, beside: Cube | None = None) -> Cube | None:

@@ -1,10 +1,10 @@
-"""Layout `rig`: band files of a multispectral camera, one TIFF for each lens and release of the shutter.
+"""Layout `rig`: band files of a multispectral camera, one TIFF for each lens and shot.
 
     IMG_0000_1.tif ... IMG_0000_5.tif                            MicaSense, in numbered folders
     IMG_170101_101010_0000_GRE.TIF, RED, REG, NIR (and RGB.JPG)  Parrot Sequoia
     DJI_20230101_0001_MS_G.TIF ... or DJI_0011.TIF ...           DJI
 
-Every file is a view, with the lens as its sensor. Files of one release share an identifier in their XMP, otherwise
+Every file is a view, with the lens as its sensor. Files of one shot share an identifier in their XMP, otherwise
 their name up to the band. Pictures in colour are left out, as nothing says what their channels measure; so are thermal
 bands.
 
@@ -42,7 +42,7 @@ _BAND_ENDING = re.compile(r"(?:_MS)?[_-](\d{1,2}|GRE|GREEN|RED|REG|REDEDGE|RE|NI
 _DJI_NUMBER = re.compile(r"(DJI_\d+)(\d)$", re.I)
 """Of a Phantom 4 Multispectral: the last digit is the band, 0 the colour picture."""
 _EVAL_INTERVAL = 8
-"""Every so many releases, one is for evaluation."""
+"""Every so many shots, one is for evaluation."""
 _UNIQUE_TAGS = ("MicaSense:CaptureId", "CaptureUUID", "CaptureId")
 _MM_OF_UNIT: dict[float, float] = {2.0: 25.4, 3.0: 10.0, 4.0: 1.0, 5.0: 1e-3}
 """Millimetres in EXIF's FocalPlaneResolutionUnit: inch, cm, mm, micrometre."""
@@ -53,7 +53,7 @@ _LONGEST_MM = 50.0
 
 def find_rig(root: Path, options: ReadOptions) -> Capture:
     """The views of a multispectral camera; see the module. Raises CaptureError: no band files, one can't be read, two
-    of one release are of the same lens, or files of one lens differ in size or band."""
+    of one shot are of the same lens, or files of one lens differ in size or band."""
     excluded = {path.resolve() for path in options.exclude}
     paths = [path for path in sorted(root.rglob("*")) if path.is_file() and path.resolve() not in excluded]
     paths = [path for path in paths if not any(part.startswith(".") for part in path.relative_to(root).parts)]
@@ -68,8 +68,8 @@ def find_rig(root: Path, options: ReadOptions) -> Capture:
             f"{root} holds no TIFF files of single bands, such as IMG_0000_1.tif, IMG_..._GRE.TIF or DJI_..._MS_G.TIF: "
             "give the folder of the flight, or use the layout 'cubes'"
         )
-    sensors, releases = _sensor_names(bands), _release_names(bands, str(root))
-    splits = _splits_of(releases)
+    sensors, shots = _sensor_names(bands), _shot_names(bands, str(root))
+    splits = _splits_of(shots)
     names = view_names([str(item.file.path.relative_to(root)) for item in bands], str(root))
     notes = []
     if kinds["thermal"]:
@@ -81,15 +81,15 @@ def find_rig(root: Path, options: ReadOptions) -> Capture:
     if colour := len(kinds["colour"]) + sum(path.suffix.lower() in _COLOUR_SUFFIXES for path in paths):
         pictures = f"{counted(colour, 'colour picture')} left out"
         notes.append(f"{pictures}: nothing says what their channels measure")
-    counts = Counter(releases)
-    if incomplete := [release for release, count in counts.items() if count < max(counts.values())]:
+    counts = Counter(shots)
+    if incomplete := [shot for shot, count in counts.items() if count < max(counts.values())]:
         notes.append(f"{len(incomplete)} of {len(counts)} releases lack a band: {name_some(incomplete)}")
     views: list[CaptureView] = []
     missing: Counter[tuple[str, str]] = Counter()
-    for item, name, sensor, release in zip(bands, names, sensors, releases, strict=True):
+    for item, name, sensor, shot in zip(bands, names, sensors, shots, strict=True):
         lens, why_not = lens_of(item.file)
         missing.update([(sensor, why_not)] if lens is None else [])
-        views.append(CaptureView(name, item.file, sensor, lens=lens, release=release, split=splits[release]))
+        views.append(CaptureView(name, item.file, sensor, lens=lens, shot=shot, split=splits[shot]))
     _check_lenses(views)
     notes += [f"lens {sensor}: {why} ({counted(n, 'file')})" for (sensor, why), n in missing.items()]
     views = _with_given_bands(views, options)
@@ -109,14 +109,14 @@ def _kind_of(file: Cube, options: ReadOptions) -> str:
 
 
 def _check_lenses(views: Sequence[CaptureView]) -> None:
-    """Refuse a lens twice in one release, and files of one lens that differ."""
+    """Refuse a lens twice in one shot, and files of one lens that differ."""
     first: dict[str, CaptureView] = {}
     taken: dict[tuple[str, str], CaptureView] = {}
     for view in views:
-        other = taken.setdefault((view.release, view.sensor), view)
+        other = taken.setdefault((view.shot, view.sensor), view)
         if other is not view:
             both = f"{other.cube.path} and {view.cube.path} are both the lens {view.sensor}"
-            raise CaptureError(f"{both} of the release {view.release}; remove the copy")
+            raise CaptureError(f"{both} of the release {view.shot}; remove the copy")
         same = first.setdefault(view.sensor, view)
         tables = (same.cube.bands.wavelengths_nm, view.cube.bands.wavelengths_nm)
         centres = [None if table is None else float(table[0]) for table in tables]
@@ -184,8 +184,8 @@ def _sensor_names(bands: Sequence[_BandFile]) -> list[str]:
     ]
 
 
-def _release_names(bands: Sequence[_BandFile], where: str) -> list[str]:
-    """Names up to the band of the first file of each release, with its folder where names repeat. Identifiers count
+def _shot_names(bands: Sequence[_BandFile], where: str) -> list[str]:
+    """Names up to the band of the first file of each shot, with its folder where names repeat. Identifiers count
     where they join files; cameras that write another one into every file are grouped by name."""
     identifiers = [tag_text(item.tags, *_UNIQUE_TAGS) or "" for item in bands]
     counts = Counter(identifier for identifier in identifiers if identifier)
@@ -200,12 +200,12 @@ def _release_names(bands: Sequence[_BandFile], where: str) -> list[str]:
     return [names[key] for key in keys]
 
 
-def _splits_of(releases: Iterable[str]) -> dict[str, Split]:
-    """One of every eight releases is for evaluation, with all its lenses: in their middle, since what the first and
+def _splits_of(shots: Iterable[str]) -> dict[str, Split]:
+    """One of every eight shots is for evaluation, with all its lenses: in their middle, since what the first and
     the last of a flight show no other does."""
-    names = sorted(set(releases), key=natural_order)
+    names = sorted(set(shots), key=natural_order)
     evaluated = names[min(_EVAL_INTERVAL, len(names)) // 2 :: _EVAL_INTERVAL]
-    return {release: "eval" if release in evaluated else "train" for release in names}
+    return {shot: "eval" if shot in evaluated else "train" for shot in names}
 
 
 def lens_of(file: Cube) -> tuple[Lens | None, str]:
@@ -269,8 +269,8 @@ def _dji_lens(file: Cube, tags: XmpTags) -> Lens:
     fx, fy, cx, cy, k1, k2, p1, p2, k3 = numbers
     plain = Lens(width, height, (fx, fy), (middle[0] + cx + 0.5, middle[1] + cy + 0.5))
     if flag := (tag_numbers(tags, "DewarpFlag") or [0.0])[0]:
-        said = f"the camera took out the distortion (DewarpFlag {flag:g}), so the lens has none"
-        return replace(plain, said=said)
+        note = f"the camera took out the distortion (DewarpFlag {flag:g}), so the lens has none"
+        return replace(plain, note=note)
     return replace(plain, distortion=(k1, k2, p1, p2), higher_radial=(k3, 0.0))
 
 

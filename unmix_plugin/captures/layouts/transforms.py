@@ -224,7 +224,7 @@ def _find_cubes(layout: str, root: Path, options: ReadOptions) -> Capture:
         )
         unlabelled += labels is None and frame.text("seg_file_path") != ""
         file, split, shot = _open_cube(cube, said, options), frame.split or split, frame.text("capture")
-        view = CaptureView(name, file, said.sensor, picture, mask, labels, release=shot, split=split)
+        view = CaptureView(name, file, said.sensor, picture, mask, labels, shot=shot, split=split)
         views.append(view)
     found.refuse_missing(
         "copy them into the folder; if there are RGB pictures alone, take the layout 'nerfstudio'"

@@ -55,7 +55,7 @@ class Lens:
     resampled_from: Project | None = None
     """Where the pixels of the file were taken through a model that scenes do not have, and are to be brought into this
     lens: from ideal coordinates to the file's pixels."""
-    said: str = field(default="", compare=False)
+    note: str = field(default="", compare=False)
     """What stands for what, where the file has a lens of another model."""
 
     @property
@@ -145,12 +145,12 @@ def fit_lens(project: Project, start: Lens, model: str, where: str) -> Lens:
     if ideal is not None and np.linalg.norm(ideal, axis=1).max() < np.tan(np.radians(_WIDEST_DEG)):
         lens, worst = _nearest_opencv(pixels, ideal, start)
         if worst <= _LARGEST_ERROR_PX:
-            said = f"lens model {model} replaced by the nearest OPENCV lens; off by at most {worst:.2g} px"
-            return replace(lens, said=said)
+            note = f"lens model {model} replaced by the nearest OPENCV lens; off by at most {worst:.2g} px"
+            return replace(lens, note=note)
         if not _folds(lens):
             nearest = f"no OPENCV lens comes nearer than {worst:.2g} px"
-            said = f"lens model {model}: {nearest}, so pixels are interpolated into that one"
-            return replace(lens, resampled_from=project, said=said)
+            note = f"lens model {model}: {nearest}, so pixels are interpolated into that one"
+            return replace(lens, resampled_from=project, note=note)
     found = _widest_pinhole(project, start)
     if found is None:
         raise CaptureError(
@@ -158,12 +158,12 @@ def fit_lens(project: Project, start: Lens, model: str, where: str) -> Lens:
         )
     pinhole, outside = found
     corner = np.hypot(pinhole.width, pinhole.height) / 2 / pinhole.focal_px[0]
-    said = (
+    note = (
         f"lens model {model} sees too much for an OPENCV lens, so pixels are interpolated into a pinhole that reaches "
         f"{np.degrees(np.arctan(corner)):.0f} degrees from the axis to its corners; {outside:.0%} of the picture lies "
         "outside and is left out"
     )
-    return replace(pinhole, resampled_from=project, said=said)
+    return replace(pinhole, resampled_from=project, note=note)
 
 
 def bent_lens(bend: Bend, terms: Sequence[float], start: Lens, model: str, where: str) -> Lens:

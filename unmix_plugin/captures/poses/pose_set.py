@@ -148,7 +148,7 @@ def make_pose_set(
     lenses = dict.fromkeys(camera.lens for camera in unique.values() if camera.lens is not None)
     for lens in lenses:
         require_possible(lens, where)
-    said = [*notes, *(lens.said for lens in lenses if lens.said)]
+    said = [*notes, *(lens.note for lens in lenses if lens.note)]
     scaled = scales[np.abs(scales - 1.0) > _SCALE_TOLERANCE]
     if len(scaled):
         low, high = scaled.min(), scaled.max()

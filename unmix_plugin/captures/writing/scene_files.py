@@ -213,6 +213,16 @@ def _transforms_json(
         own = {key: value for key, value in known.items() if key not in shared}
         pose = matrix_entry(written.camera.camera_to_world)
         frames.append({**written.record.paths, **own, "transform_matrix": pose})
+
+    # Widths of all bands as the files tell them, if all are known and bands are not averaged.
+    known_nm: dict[float, float] = {}
+    for view in views:
+        sensor, widths_nm = plan.sensors[view.sensor], view.cube.bands.fwhm_nm
+        if widths_nm is not None and sensor.calibration.bin_bands == 1:
+            of_kept = widths_nm[sensor.calibration.bands].tolist()
+            known_nm |= zip(sensor.centers_nm.tolist(), of_kept, strict=True)
+    widths = {"fwhm": [known_nm[band] for band in bands.tolist()]} if len(known_nm) == len(bands) else {}
+
     splits = {}
     if {"train", "eval"} <= {view.split for view in views}:  # others are in neither list
         names: dict[str, list[str]] = defaultdict(list)
@@ -224,7 +234,7 @@ def _transforms_json(
         "camera_model": "OPENCV",
         **shared,
         "wavelengths": bands.tolist(),
-        **_widths(plan, views, bands),
+        **widths,
         "value_scale": FULL_SCALE,
         "calibrated_value_of_1": plan.scale.value,
         **extra,
@@ -243,24 +253,11 @@ def _facts(
     facts |= lens_keys(lens.focal_px, lens.center_px, (*lens.distortion, *lens.higher_radial))
     if view.sensor:
         facts["sensor"] = view.sensor
-    if view.release:
-        facts["capture"] = view.release
+    if view.shot:
+        facts["capture"] = view.shot
     if len(centers_nm) < len(bands):
         facts["bands"] = np.searchsorted(bands, centers_nm).tolist()
     return facts
-
-
-def _widths(
-    plan: Plan, views: Sequence[CaptureView], bands: Float64[np.ndarray, " B"]
-) -> dict[str, list[float]]:
-    """Widths of all bands as the files tell them, if all are known and bands are not averaged."""
-    known: dict[float, float] = {}
-    for view in views:
-        calibration, widths_nm = plan.sensors[view.sensor].calibration, view.cube.bands.fwhm_nm
-        if widths_nm is not None and calibration.bin_bands == 1:
-            centers_nm = plan.sensors[view.sensor].centers_nm
-            known |= zip(centers_nm.tolist(), widths_nm[calibration.bands].tolist(), strict=True)
-    return {"fwhm": [known[band] for band in bands.tolist()]} if len(known) == len(bands) else {}
 
 
 def _sizes_in_words(plan: Plan) -> str:
