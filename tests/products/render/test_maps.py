@@ -227,3 +227,18 @@ def test_names_of_bands_are_text_and_no_markup():
     *_, text, _ = gdal_metadata(['a<b>&"c"', "ß"])
     names = [one.text for one in ElementTree.fromstring(text.rstrip(b"\0").decode())]
     assert names == ['a<b>&"c"', "ß"]
+
+
+def test_gdal_itself_shows_names_and_wavelengths_of_bands(tmp_path):
+    rasterio = pytest.importorskip("rasterio")
+    rendered(tmp_path, ["spectral", "abundances", "false-colour:650,550,450"], ["tif"], 0.5)
+    with rasterio.open(tmp_path / "spectral" / "map_top.tif") as file:
+        assert file.descriptions == tuple(f"{nm:g} nm" for nm in SCENE.bands.centers_nm)
+        for band, nm in zip(file.indexes, SCENE.bands.centers_nm, strict=True):
+            assert file.tags(band) == {"wavelength": f"{nm:g}", "wavelength_units": "Nanometers"}
+            shown_um = file.tags(band, ns="IMAGERY")["CENTRAL_WAVELENGTH_UM"]
+            assert float(shown_um) == pytest.approx(nm / 1000)
+    with rasterio.open(tmp_path / "abundances" / "map_top.tif") as file:
+        assert file.descriptions == SCENE.materials.names
+    with rasterio.open(tmp_path / "false-colour-650-550-450" / "map_top.tif") as file:
+        assert [one.name for one in file.colorinterp] == ["red", "green", "blue"]
