@@ -86,20 +86,19 @@ class Backdrop:
         return self._look(fit_surfaces(features, known, self.brightest))
 
     def _look(self, view: FittedView) -> LookedAt | None:
-        """At those surfaces of a view that are the backdrop's."""
-        surfaces = [surface for surface in view.surfaces if self._is_like(surface.level)]
+        """The surfaces of a view that are near one of the backdrop's, or are one in more or in less light."""
+        surfaces = []
+        for surface in view.surfaces:
+            gains = (self.levels @ surface.level) / np.maximum(np.square(self.levels).sum(-1), 1e-12)
+            lit = np.clip(gains, 1 / _MOST_SHADED, _MOST_SHADED)[:, None] * self.levels
+            is_near = norm(self.levels - surface.level) < _MOST_UNLIKE * self.brightest
+            if (is_near | (norm(lit - surface.level) < FIRST_TOLERANCE * self.brightest)).any():
+                surfaces.append(surface)
         return replace(view, surfaces=surfaces).look() if surfaces else None
 
     def spectra(self, features: Float32[np.ndarray, "*P k"]) -> Float32[np.ndarray, "*P B"]:
         """Spectra of these features, of one pixel or of many."""
         return features @ self.basis.T
-
-    def _is_like(self, level: Float32[np.ndarray, " k"]) -> bool:
-        """Whether features are near those of a surface that was looked at, or of it in more or in less light."""
-        share = (self.levels @ level) / np.maximum(np.square(self.levels).sum(-1), 1e-12)
-        lit = np.clip(share, 1 / _MOST_SHADED, _MOST_SHADED)[:, None] * self.levels
-        near = norm(self.levels - level) < _MOST_UNLIKE * self.brightest
-        return bool((near | (norm(lit - level) < FIRST_TOLERANCE * self.brightest)).any())
 
     @property
     def in_words(self) -> str:
@@ -142,6 +141,8 @@ class BeforeBackdrop:
 def find_before_backdrop(views: Views) -> BeforeBackdrop | None:
     """Where something may stand before a backdrop that all views share; None if there is none. Anything may stand
     before pixels that don't count."""
+    from scipy import ndimage
+
     size, count = views.cameras.size(0), len(views.cameras)
     stride = -(-max(size) // _LONGEST_SIDE_PX)
     bands = views.read(0, (slice(1), slice(1))).shape[2]
@@ -159,18 +160,15 @@ def find_before_backdrop(views: Views) -> BeforeBackdrop | None:
     masks = []
     for image, mask in (read(view) for view in range(count)):
         seen = backdrop.find(backdrop.features(image), mask)
-        masks.append(np.ones_like(mask) if seen is None else _without_specks(~seen.shown) | ~mask)
+        if seen is None:
+            masks.append(np.ones_like(mask))
+            continue
+        # Without parts that are smaller than a hole may be, wider by a pixel.
+        parts = parts_of(~seen.shown)
+        is_large = np.bincount(parts.ravel()) >= max(4.0, HOLE_SHARE * parts.size)
+        is_large[0] = False
+        masks.append(np.array(ndimage.binary_dilation(is_large[parts]), bool) | ~mask)
     return BeforeBackdrop(tuple(masks), stride, size, backdrop.in_words)
-
-
-def _without_specks(matter: Mask) -> Mask:
-    """Matter without parts that are smaller than a hole may be, wider by a pixel."""
-    from scipy import ndimage
-
-    parts = parts_of(matter)
-    kept = np.bincount(parts.ravel()) >= max(4.0, HOLE_SHARE * matter.size)
-    kept[0] = False
-    return np.array(ndimage.binary_dilation(kept[parts]), bool)
 
 
 def judge_backdrop(

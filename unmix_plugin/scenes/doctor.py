@@ -95,24 +95,20 @@ def check_lenses(cameras: Cameras) -> Finding | None:
         numbers = torch.cat([camera.focal_px, camera.center_px, camera.distortion], dim=1)
         lens = (camera.width, camera.height, *numbers[0].tolist())
         if lens not in shares:
-            shares[lens] = _unreached(camera)
+            # Share of pixels that don't come back when what lies on their rays is projected.
+            small = camera.shrunk(_PIXELS_ASKED)
+            shares[lens] = 0.0
+            if small.is_distorted:
+                rays = small.image_rays(0)
+                pixels, depths = small.project(rays.origins + rays.directions, 0)
+                assert rays.pixel_coords is not None
+                comes_back = (depths > 0) & ((pixels - rays.pixel_coords).norm(dim=1) < 1.0)
+                shares[lens] = 1.0 - float(comes_back.float().mean())
         lost.append(shares[lens])
     if max(lost, default=0.0) <= _MOST_UNREACHED:
         return None
     views = counted(sum(share > _MOST_UNREACHED for share in lost), "view")
     return Finding.of(Message.LENS_FOLDS, views=views, lost=max(lost))
-
-
-def _unreached(camera: Cameras) -> float:
-    """Share of pixels that don't come back when what lies on their rays is projected."""
-    camera = camera.shrunk(_PIXELS_ASKED)
-    if not camera.is_distorted:
-        return 0.0
-    rays = camera.image_rays(0)
-    pixels, depths = camera.project(rays.origins + rays.directions, 0)
-    assert rays.pixel_coords is not None
-    comes_back = (depths > 0) & ((pixels - rays.pixel_coords).norm(dim=1) < 1.0)
-    return 1.0 - float(comes_back.float().mean())
 
 
 def contradicted_share(cameras: Cameras, foreground: Masks) -> tuple[SceneBox | None, float]:

@@ -43,7 +43,13 @@ class AlphaEvidence:
     def __init__(self, table: PixelTable, has_alpha: bool) -> None:
         """Judge the background of each sensor; without alpha nothing contradicts anything."""
         self._blocks = table.blocks
-        self._levels = {block.sensor: _level(block) if has_alpha else None for block in self._blocks}
+        self._levels: dict[int, float | None] = {block.sensor: None for block in self._blocks}
+        for block in self._blocks if has_alpha else ():
+            stride = max(1, int(block.valid.sum()) // _PIXELS_OF_BACKGROUND)
+            is_whole = bool(block.valid.all())  # then a list of all of them would take eight bytes a pixel
+            pixels = torch.arange(0, len(block), stride) if is_whole else block.valid.nonzero()[::stride, 0]
+            chosen = pixels.to(block.alpha.device)
+            self._levels[block.sensor] = background_level(block.spectra(chosen), block.alpha[chosen])
 
     def confidence(self, pixels: DrawnPixels) -> Float[Tensor, " R"]:
         """Confidence in the alpha of drawn pixels, 0 or 1."""
@@ -114,14 +120,6 @@ def _is_clear(spectra: Tensor, alpha: Tensor, valid: Tensor) -> Tensor:
 def _clear_brightness(spectra: Tensor, alpha: Tensor, valid: Tensor) -> Tensor:
     """Of pixels that are opaque, valid and not saturated; 0 for others."""
     return torch.where(_is_clear(spectra, alpha, valid), brightness(spectra), 0.0)
-
-
-def _level(block: PixelBlock) -> float | None:
-    stride = max(1, int(block.valid.sum()) // _PIXELS_OF_BACKGROUND)
-    is_whole = bool(block.valid.all())  # then a list of all of them would take eight bytes a pixel
-    pixels = torch.arange(0, len(block), stride) if is_whole else block.valid.nonzero()[::stride, 0]
-    chosen = pixels.to(block.alpha.device)
-    return background_level(block.spectra(chosen), block.alpha[chosen])
 
 
 def judge_sensors(scene: Scene, table: PixelTable, seed: int) -> dict[int, BandNoise]:

@@ -247,9 +247,18 @@ def read_line_poses(frame: Mapping[str, Any], where: str, faults: Faults) -> Lin
         return faults.note(where, Message.NO_LINE_POSES, key=key, found=describe(entries))
     rows, poses = [], []
     for index, entry in enumerate(entries):
-        row, pose = _read_line_pose(entry, index, key == _KEY_POSES, f"{where} '{key}'[{index}]", faults)
+        place = f"{where} '{key}'[{index}]"
         # One fault is enough: a list of a thousand rows has them all wrong in one way.
-        if row is None or pose is None:
+        is_by_row, values = key == _ROW_POSES, entry if isinstance(entry, dict) else {}
+        row = float(index) if is_by_row else read_number(values.get("row"))
+        if row is None:
+            code, found = (Message.NO_ROW, values.get("row")) if values else (Message.NO_KEY_POSE, entry)
+            return faults.note(place, code, found=describe(found))
+        matrix, name = (
+            (entry, "the pose") if is_by_row else (values.get("transform_matrix"), "'transform_matrix'")
+        )
+        pose = read_pose(matrix, place, faults, name)
+        if pose is None:
             return None
         if rows and row <= rows[-1]:
             return faults.note(where, Message.ROWS_FALL, key=key, before=rows[-1], after=row)
@@ -264,21 +273,6 @@ def read_line_poses(frame: Mapping[str, Any], where: str, faults: Faults) -> Lin
         values = {"turn": turns[largest], "before": before, "after": after, "most": _GREATEST_TURN_DEG}
         return faults.note(where, Message.GREAT_TURN, **values)
     return LinePoses(np.array(rows), stacked, key == _ROW_POSES)
-
-
-def _read_line_pose(
-    entry: Any, index: int, is_key_pose: bool, where: str, faults: Faults
-) -> tuple[float | None, Float64[np.ndarray, "3 4"] | None]:
-    """Row and pose; None with a noted fault where one is wrong."""
-    if not is_key_pose:
-        return float(index), read_pose(entry, where, faults, "the pose")
-    keys = entry if isinstance(entry, dict) else {}
-    row = read_number(keys.get("row"))
-    if row is None:
-        if keys:
-            return faults.note(where, Message.NO_ROW, found=describe(keys.get("row"))), None
-        return faults.note(where, Message.NO_KEY_POSE, found=describe(entry)), None
-    return row, read_pose(keys.get("transform_matrix"), where, faults)
 
 
 @dataclass(frozen=True)

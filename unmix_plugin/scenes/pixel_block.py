@@ -191,7 +191,14 @@ class PixelBlock:
             return self._projected.spectra(pixels)
         if self._values is not None:
             return self._scaled(self._values[pixels])
-        return self._scaled(self._gathered(pixels.cpu())).to(self.alpha.device)
+        pixels = pixels.cpu()
+        rows = pixels // self._size
+        found = torch.from_numpy(np.empty((len(pixels), self.num_channels), self._kept))
+        for row in rows.unique().tolist():  # from disk
+            chosen = (rows == row).nonzero()[:, 0]
+            lines, columns = np.divmod((pixels[chosen] - row * self._size).numpy(), self._width)
+            found[chosen] = self._stored(self._views[row], (lines, columns))
+        return self._scaled(found).to(self.alpha.device)
 
     def _neighbours(self, first: int, last: int) -> Spectra:
         """The same of pixels that follow each other."""
@@ -263,13 +270,3 @@ class PixelBlock:
             rows = self._stored(self._views[row], (slice(top, bottom),))
             parts.append(rows[start - top * width : end - top * width])
         return torch.cat(parts)
-
-    def _gathered(self, pixels: Pixels) -> Tensor:
-        """Values of any pixels of the block, from disk."""
-        rows = pixels // self._size
-        found = torch.from_numpy(np.empty((len(pixels), self.num_channels), self._kept))
-        for row in rows.unique().tolist():
-            chosen = (rows == row).nonzero()[:, 0]
-            lines, columns = np.divmod((pixels[chosen] - row * self._size).numpy(), self._width)
-            found[chosen] = self._stored(self._views[row], (lines, columns))
-        return found

@@ -62,16 +62,6 @@ def available_bytes(device: torch.device) -> int | None:
     return min(free, max(0, limit - used))
 
 
-def _budget_bytes(device: torch.device, memory_gb: float | None) -> int | None:
-    """Memory that pixels may take, by default most of what the device has left; None where nothing limits it."""
-    if memory_gb is not None:
-        return int(_GIVEN_SHARE * memory_gb * _GIB)
-    available = available_bytes(device)
-    if available is not None and device.type == "cpu":
-        available //= processes_here()
-    return None if available is None else int(_USABLE_SHARE * available)
-
-
 Components: TypeAlias = int | Literal["auto", "none"]
 
 
@@ -110,10 +100,16 @@ class PixelTable:
         if not any(bool(block.valid.any()) for block in self.blocks):
             raise ConfigError(Message.NO_VALID_PIXEL.sentence())
         self._scene, self._seed, self._mends = scene, seed, mends
-        self.notes = self._read(_budget_bytes(device, memory_gb), memory_gb is None, components)
+        self.notes = self._read(device, memory_gb, components)
         """What a user should know of pixels that are not held as they were stored."""
 
-    def _read(self, budget: int | None, is_automatic: bool, components: Components) -> list[str]:
+    def _read(self, device: torch.device, memory_gb: float | None, components: Components) -> list[str]:
+        """Hold all pixels, as they are stored or as components, or else a pool of them; gives the notes."""
+        budget = None if memory_gb is None else int(_GIVEN_SHARE * memory_gb * _GIB)
+        if memory_gb is None and (available := available_bytes(device)) is not None:
+            budget = int(
+                _USABLE_SHARE * (available // processes_here() if device.type == "cpu" else available)
+            )
         total = sum(block.num_bytes for block in self.blocks)
         fits = budget is None or total <= budget
         found = {} if components == "none" or (components == "auto" and fits) else self._projected(components)
@@ -124,11 +120,18 @@ class PixelTable:
         spare = None if budget is None else budget - needed
         if (spare is None or spare >= 0) and self._hold(found, spare):
             return [projection.describe() for projection in found.values()]
+
         budget = needed if budget is None else budget
-        held = min(_LARGEST_POOL, budget) if is_automatic else budget
+        pool = min(_LARGEST_POOL, budget) if memory_gb is None else budget
         for block in self.blocks:
-            block.hold_part(held * block.num_bytes // total)
-        return self._pool_notes(total, max(needed, budget), components)
+            block.hold_part(pool * block.num_bytes // total)
+        held = sum(block.pool.num_bytes for block in self.blocks if block.pool is not None)
+        what = " and ".join(block.description for block in self.blocks)
+        notes = [Message.KEPT_ON_DISK.sentence(what=what, total=total / _GIB, held=held / _GIB)]
+        if not isinstance(components, str):
+            values = {"components": components, "needed": max(needed, budget) / _GIB}
+            notes.append(Message.COMPONENTS_OF_NO_USE.sentence(**values))
+        return notes
 
     def _hold(self, found: Mapping[int, Projection], spare: int | None) -> bool:
         """Read all pixels, those of some sensors as components, into so many bytes more than is expected; None for any
@@ -147,16 +150,6 @@ class PixelTable:
                 return False
             spare = None if spare is None else spare - max(0, block.held_bytes - expected)
         return True
-
-    def _pool_notes(self, total: int, needed: int, components: Components) -> list[str]:
-        """What stays on disk, in words, and that components don't help, which need at least so many bytes."""
-        held = sum(block.pool.num_bytes for block in self.blocks if block.pool is not None)
-        what = " and ".join(block.description for block in self.blocks)
-        notes = [Message.KEPT_ON_DISK.sentence(what=what, total=total / _GIB, held=held / _GIB)]
-        if not isinstance(components, str):
-            values = {"components": components, "needed": needed / _GIB}
-            notes.append(Message.COMPONENTS_OF_NO_USE.sentence(**values))
-        return notes
 
     def _projected(self, components: Components) -> dict[int, Projection]:
         """By sensor, of blocks whose pixels are to be kept as components."""
@@ -211,31 +204,23 @@ class PixelTable:
         evenly. What pixels on disk are drawn from moves on with the step of the training."""
         counts = [count]
         if len(self.blocks) != 1 or self.blocks[0].pool is not None:
-            counts = self._counts(count, generator, self.shares if shares is None else shares)
+            # As many pixels of each block as chance gives its sensor.
+            shares = self.shares if shares is None else shares
+            bounds = torch.tensor([shares.get(block.sensor, 0.0) for block in self.blocks]).cumsum(0)
+            places = torch.rand(count, generator=generator).clamp(max=float(bounds[-1]) - 1e-6)
+            counts = torch.bincount(torch.searchsorted(bounds, places), minlength=len(self.blocks)).tolist()
         groups = []
         for index, (block, number) in enumerate(zip(self.blocks, counts, strict=True)):
-            if number:
-                pixels, stored = (
-                    (self._drawn(index, number, generator), None)
-                    if block.pool is None
-                    else block.pool.draw(number, step, generator)
-                )
-                groups.append(block.take(pixels, self._firsts[index], stored))
+            first = self._firsts[index]
+            if number and block.pool is not None:
+                pixels, stored = block.pool.draw(number, step, generator)
+                groups.append(block.take(pixels, first, stored))
+            elif number:
+                valid = self._valid[index]
+                size = len(block) if valid is None else len(valid)
+                drawn = torch.randint(size, (number,), generator=generator)
+                groups.append(block.take(drawn if valid is None else valid[drawn].long(), first))
         return tuple(groups)
-
-    def _drawn(self, block: int, count: int, generator: torch.Generator) -> Int[Tensor, " R"]:
-        """Random valid pixels of a block held in memory, by their index in it."""
-        valid = self._valid[block]
-        drawn = torch.randint(
-            len(self.blocks[block]) if valid is None else len(valid), (count,), generator=generator
-        )
-        return drawn if valid is None else valid[drawn].long()
-
-    def _counts(self, count: int, generator: torch.Generator, shares: Mapping[int, float]) -> list[int]:
-        """As many pixels of each block as chance gives its sensor."""
-        bounds = torch.tensor([shares.get(block.sensor, 0.0) for block in self.blocks]).cumsum(0)
-        places = torch.rand(count, generator=generator).clamp(max=float(bounds[-1]) - 1e-6)
-        return torch.bincount(torch.searchsorted(bounds, places), minlength=len(self.blocks)).tolist()
 
     def sample_opaque(
         self, sensor: int, count: int, seed: int, kept: Bool[Tensor, " pixels"] | None = None

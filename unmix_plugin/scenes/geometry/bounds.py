@@ -95,23 +95,19 @@ def _box_of_places(cameras: Cameras, points: MatchedPoints) -> SceneBox:
     places, margin = near.places.double().numpy(), _PLACES_MARGIN * float(near.depths.median())
     low, high = np.quantile(places, (_OUTLIERS, 1 - _OUTLIERS), axis=0)
     if points.are_equally_far:
-        corners = _corners_at_depth(cameras, near)
+        ends = []  # corners of each view, as deep as most of the places that it shows
+        for view in range(len(cameras)):
+            depths = near.depths[near.views == view]
+            depth = float((depths if len(depths) else near.depths).median())
+            width, height = cameras.size(view)
+            coords = torch.tensor([(x, y) for x in (0.0, float(width)) for y in (0.0, float(height))])
+            rays = cameras.generate_rays(torch.full((4,), view), coords)
+            assert rays.axes is not None
+            away = depth / (rays.directions * rays.axes).sum(dim=-1)
+            ends.append(rays.origins + away[:, None] * rays.directions)
+        corners = torch.cat(ends).double().numpy()
         low, high = np.minimum(low, corners.min(axis=0)), np.maximum(high, corners.max(axis=0))
     return _box(low - margin, high + margin)
-
-
-def _corners_at_depth(cameras: Cameras, points: MatchedPoints) -> Float64[np.ndarray, "P 3"]:
-    """The corners of each view, as deep as most of the places that it shows."""
-    usual, ends = float(points.depths.median()), []
-    for view in range(len(cameras)):
-        own = points.depths[points.views == view]
-        width, height = cameras.size(view)
-        coords = torch.tensor([(x, y) for x in (0.0, float(width)) for y in (0.0, float(height))])
-        rays = cameras.generate_rays(torch.full((4,), view), coords)
-        assert rays.axes is not None
-        away = (float(own.median()) if len(own) else usual) / (rays.directions * rays.axes).sum(dim=-1)
-        ends.append(rays.origins + away[:, None] * rays.directions)
-    return torch.cat(ends).double().numpy()
 
 
 def _cube_of_views(cameras: Cameras) -> tuple[Float64[np.ndarray, "3"], float]:

@@ -211,7 +211,16 @@ class _View:
         self._center = cameras.center_px[index].numpy()[:, None]
         self._distortion = cameras.distortion[index] if cameras.is_distorted else None
         self._sides = np.array(cameras.size(index), dtype=np.float32)[:, None]
-        self._low, self._high = self._ideal_bounds()
+        self._low, self._high = -self._center / self._focal, (self._sides - self._center) / self._focal
+        if self._distortion is not None:
+            # Bounds in ideal coordinates, from the image's border; far outside them a lens model folds over.
+            along = np.linspace(0.0, 1.0, _BORDER_POINTS, dtype=np.float32)
+            ends = np.repeat(np.array([0.0, 1.0], dtype=np.float32), _BORDER_POINTS)
+            both = np.tile(along, 2)
+            border = np.concatenate([np.stack([both, ends]), np.stack([ends, both])], axis=1) * self._sides
+            distorted = torch.from_numpy(((border - self._center) / self._focal).T.copy())
+            ideal = undistort(distorted, self._distortion).numpy()
+            self._low, self._high = ideal.min(axis=0)[:, None], ideal.max(axis=0)[:, None]
         self.covered = None if foreground is None else _Covered(foreground)
 
     def judge(self, centres: _Centres, half: Float32[np.ndarray, "3"], near: float) -> _Judged:
@@ -232,36 +241,20 @@ class _View:
         chosen = np.flatnonzero(inside[0] & inside[1] & (nearest > 1e-6))
         low, high = low.take(chosen, axis=1), high.take(chosen, axis=1)
         if self._distortion is not None:
-            low, high = _bend(low, high, self._distortion)
+            # From corners, middles of edges and centres: a bulge between these is of second order in a cell's size and
+            # stays within `_PIXEL_MARGIN`.
+            columns, rows = (
+                np.stack([low[axis], 0.5 * (low[axis] + high[axis]), high[axis]]) for axis in (0, 1)
+            )
+            points = np.stack(np.broadcast_arrays(columns[:, None], rows[None, :]), axis=-1)
+            distorted = distort(torch.from_numpy(points), self._distortion).numpy().reshape(9, -1, 2)
+            low, high = distorted.min(axis=0).T, distorted.max(axis=0).T
         low = low * self._focal + (self._center - _PIXEL_MARGIN)
         high = high * self._focal + (self._center + _PIXEL_MARGIN)
         fits = np.flatnonzero((low >= 0.0).all(axis=0) & (high < self._sides).all(axis=0))
         empty = np.zeros(len(nearest), dtype=bool)
         empty[chosen[fits]] = self.covered.is_empty(low.take(fits, axis=1), high.take(fits, axis=1))
         return sees, empty
-
-    def _ideal_bounds(self) -> tuple[Float32[np.ndarray, "2 1"], Float32[np.ndarray, "2 1"]]:
-        """Bounds of the image in ideal coordinates, from its border; far outside them a lens model folds over."""
-        if self._distortion is None:
-            return -self._center / self._focal, (self._sides - self._center) / self._focal
-        along = np.linspace(0.0, 1.0, _BORDER_POINTS, dtype=np.float32)
-        ends = np.repeat(np.array([0.0, 1.0], dtype=np.float32), _BORDER_POINTS)
-        both = np.tile(along, 2)
-        border = np.concatenate([np.stack([both, ends]), np.stack([ends, both])], axis=1) * self._sides
-        bent = torch.from_numpy(((border - self._center) / self._focal).T.copy())
-        ideal = undistort(bent, self._distortion).numpy()
-        return ideal.min(axis=0)[:, None], ideal.max(axis=0)[:, None]
-
-
-def _bend(low: _Bounds, high: _Bounds, distortion: Float[Tensor, " D"]) -> tuple[_Bounds, _Bounds]:
-    """Bounds of distorted rectangles, from their corners, the middles of their edges and their centres.
-
-    A bulge between these points is of second order in a cell's size and stays within `_PIXEL_MARGIN`.
-    """
-    columns, rows = (np.stack([low[axis], 0.5 * (low[axis] + high[axis]), high[axis]]) for axis in (0, 1))
-    points = np.stack(np.broadcast_arrays(columns[:, None], rows[None, :]), axis=-1)
-    bent = distort(torch.from_numpy(points), distortion).numpy().reshape(9, -1, 2)
-    return bent.min(axis=0).T, bent.max(axis=0).T
 
 
 class _LineView:

@@ -89,9 +89,15 @@ def seen_places(
     or its picture is NaN: background, saturated pixels."""
     hull = coarse_hull(hull)
     places = _hull_places(hull, box)
-    seen = [
-        _looked_up(cameras, index, image, places, hull, box) for index, image in enumerate(log_brightness)
-    ]
+    seen = []
+    for index, image in enumerate(log_brightness):
+        coords, _, inside = look_up(cameras, index, places.positions)
+        towards = cameras.camera_to_world[index, :, 3] - places.positions
+        towards = torch.nn.functional.normalize(towards, dim=-1)
+        inside &= (towards * places.normals).sum(dim=-1) > _LEAST_FACING
+        inside &= ~_is_hidden(places.positions, towards, hull, box)
+        columns, rows = torch.where(inside[:, None], coords, 0.0).long().unbind(-1)
+        seen.append(torch.where(inside, torch.from_numpy(image).float()[rows, columns], torch.nan))
     return places, torch.stack(seen, dim=1)
 
 
@@ -113,18 +119,6 @@ def local_log_brightness(seen: Float[Tensor, "H W"]) -> Float[np.ndarray, "H W"]
     weights = ndimage.uniform_filter(known.astype(np.float32), 3)
     means = ndimage.uniform_filter(np.where(known, seen.numpy(), 0.0), 3) / np.maximum(weights, 1e-6)
     return np.where(known, np.log(np.where(known, means, 1.0)), np.nan)
-
-
-def _looked_up(
-    cameras: Cameras, index: int, image: Float[np.ndarray, "H W"], places: Places, hull: Cells, box: SceneBox
-) -> Float[Tensor, " P"]:
-    """What a view shows of the places, NaN where it does not see them."""
-    coords, _, inside = look_up(cameras, index, places.positions)
-    towards = torch.nn.functional.normalize(cameras.camera_to_world[index, :, 3] - places.positions, dim=-1)
-    inside &= (towards * places.normals).sum(dim=-1) > _LEAST_FACING
-    inside &= ~_is_hidden(places.positions, towards, hull, box)
-    columns, rows = torch.where(inside[:, None], coords, 0.0).long().unbind(-1)
-    return torch.where(inside, torch.from_numpy(image).float()[rows, columns], torch.nan)
 
 
 def _is_hidden(

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Float, Float32, Int
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
@@ -125,7 +125,8 @@ def _choose_pairs(positions: Float[Tensor, "N 3"]) -> list[tuple[int, int]]:
 
 
 def _features_of(thinned: ThinnedViews, view: int) -> _Features:
-    from skimage.feature import SIFT  # slow to import
+    from scipy import ndimage  # slow to import
+    from skimage.feature import SIFT
 
     brightness = thinned.read(view).mean(dim=-1).nan_to_num(0.0, 0.0, 0.0)
     share = thinned.valid_share(view)
@@ -140,22 +141,15 @@ def _features_of(thinned: ThinnedViews, view: int) -> _Features:
     descriptors = np.array(sift.descriptors, dtype=np.float32)
     columns, rows = coords.long().unbind(-1)
     if not bool(counts.all()):
-        reach = _REACH * torch.from_numpy(np.array(sift.sigmas, dtype=np.float32))
-        kept = _away_from_invalid(counts)[rows, columns] > reach
-        coords, rows, columns = (values[kept] for values in (coords, rows, columns))
-        descriptors = descriptors[kept.numpy()]
+        # No descriptor may reach into a part, larger than a speck, that does not count.
+        parts = ndimage.binary_opening(~counts.numpy(), np.ones((_SPECK_PX, _SPECK_PX)))
+        if parts.any():
+            away = torch.from_numpy(ndimage.distance_transform_edt(np.logical_not(parts))).float()
+            kept = away[rows, columns] > _REACH * torch.from_numpy(np.array(sift.sigmas, dtype=np.float32))
+            coords, rows, columns = (values[kept] for values in (coords, rows, columns))
+            descriptors = descriptors[kept.numpy()]
     seen = local_log_brightness(torch.where(counts, brightness, 0.0))
     return _Features(thinned.whole(coords), descriptors, torch.from_numpy(seen).float()[rows, columns])
-
-
-def _away_from_invalid(counts: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-    """How far each pixel is from the nearest part, larger than a speck, that does not count; inf without any."""
-    from scipy import ndimage  # slow to import
-
-    parts = ndimage.binary_opening(~counts.numpy(), np.ones((_SPECK_PX, _SPECK_PX)))
-    if not parts.any():
-        return torch.full(counts.shape, torch.inf)
-    return torch.from_numpy(ndimage.distance_transform_edt(np.logical_not(parts))).float()
 
 
 def _triangulate(

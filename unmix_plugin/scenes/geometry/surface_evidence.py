@@ -194,24 +194,17 @@ def _seen_through(depths: _SweptDepths, cameras: Cameras, box: SceneBox, cells: 
     margins = _MARGIN * 4.0 / cells * float(space.half_edge) * radii.square()
     through, surfaces = torch.zeros(2, len(points))
     for view, distances in zip(depths.views, depths.distances, strict=True):
-        nearest, own, away = _looked_up(cameras, view, points, distances, depths.stride)
+        # Of the pixel that a point falls on: its distance, and the least of those around it.
+        pixels, _, is_seen = look_up(cameras, view, points)
+        least = -torch.nn.functional.max_pool2d(-distances[None], 3, stride=1, padding=1)[0]
+        columns, rows = (pixels / depths.stride).nan_to_num(0.0).clamp(0.0, 1e6).long().unbind(-1)
+        rows, columns = rows.clamp(max=len(distances) - 1), columns.clamp(max=distances.shape[1] - 1)
+        own, nearest = distances[rows, columns].masked_fill(~is_seen, torch.inf), least[rows, columns]
+        away = (points - cameras.camera_to_world[view, :, 3]).norm(dim=-1)
         through += torch.isfinite(own) & (away + margins < nearest)
         surfaces += (away - own).abs() <= margins
     is_empty = (through >= _WITNESSES) & (surfaces <= _MOST_CONTRADICTION * through)
     return is_empty.view(cells, cells, cells)
-
-
-def _looked_up(
-    cameras: Cameras, view: int, points: Float[Tensor, "P 3"], distances: Float[Tensor, "h w"], stride: int
-) -> tuple[Float[Tensor, " P"], Float[Tensor, " P"], Float[Tensor, " P"]]:
-    """Of the pixel that a point falls on: the least distance of those around it, its own, and the point's."""
-    pixels, _, is_seen = look_up(cameras, view, points)
-    least = -torch.nn.functional.max_pool2d(-distances[None], 3, stride=1, padding=1)[0]
-    columns, rows = (pixels / stride).nan_to_num(0.0).clamp(0.0, 1e6).long().unbind(-1)
-    rows, columns = rows.clamp(max=len(distances) - 1), columns.clamp(max=distances.shape[1] - 1)
-    own = distances[rows, columns].masked_fill(~is_seen, torch.inf)
-    away = (points - cameras.camera_to_world[view, :, 3]).norm(dim=-1)
-    return least[rows, columns], own, away
 
 
 class SurfaceEvidence:

@@ -298,8 +298,26 @@ def _check_values(
     unscaled = [cube for cube in cubes if cube.is_integer and options.value_scale is None]
     scaled = [cube for cube in cubes if not cube.is_integer or options.value_scale is not None]
     _note_invalid(scaled, options.invalid_pixels, faults)
-    _note_integers(unscaled, faults)
-    _note_far_off(scaled, options.value_scale, faults)
+    if unscaled:  # one proposal serves the whole scene, from its greatest value
+        greatest, proposed = max(cube.greatest for cube in unscaled), _propose_scale(unscaled)
+        meaning = f" ({_INTEGER_SCALES[proposed]})" if proposed in _INTEGER_SCALES else ""
+        for cube in unscaled:
+            faults.note(cube.where, Message.CUBE_INTEGER, greatest=greatest, scale=proposed, meaning=meaning)
+
+    # Values that can't be meant as [0, 1], as saturated highlights in a few places can.
+    scale = options.value_scale
+    most_share = _EXCESS_SHARE if scale is None else _EXCESS_SHARE_SCALED
+    most = _EXCESS_VALUE if scale is None else np.inf
+    far_off = [cube for cube in scaled if cube.share_above_one > most_share or cube.greatest > most]
+    if far_off:
+        values = {
+            "given": "" if scale is None else f" after division by --value-scale {scale:g}",
+            "greatest": max(cube.greatest for cube in far_off),
+            "scale": _propose_scale(far_off),
+            "or_clip": ", or to 1 to clip highlights at 1" if scale is None else "",
+        }
+        for cube in far_off:
+            faults.note(cube.where, Message.CUBE_FAR_OFF, **values)
     return measured
 
 
@@ -379,30 +397,3 @@ def _note_invalid(cubes: Sequence[_CubeValues], invalid_pixels: str, faults: Fau
     for cube in refused:
         values = {"pixels": invalid, "all_pixels": pixels, "lowest": lowest, "remedy": remedy}
         faults.note(cube.where, Message.CUBE_INVALID, subject=subject, found=found, **values)
-
-
-def _note_integers(cubes: Sequence[_CubeValues], faults: Faults) -> None:
-    """Integers without a scale; one proposal serves the whole scene, from its greatest value."""
-    if not cubes:
-        return
-    greatest, scale = max(cube.greatest for cube in cubes), _propose_scale(cubes)
-    meaning = f" ({_INTEGER_SCALES[scale]})" if scale in _INTEGER_SCALES else ""
-    for cube in cubes:
-        faults.note(cube.where, Message.CUBE_INTEGER, greatest=greatest, scale=scale, meaning=meaning)
-
-
-def _note_far_off(cubes: Sequence[_CubeValues], scale: float | None, faults: Faults) -> None:
-    """Values that can't be meant as [0, 1], as saturated highlights in a few places can."""
-    most_share = _EXCESS_SHARE if scale is None else _EXCESS_SHARE_SCALED
-    most = _EXCESS_VALUE if scale is None else np.inf
-    far = [cube for cube in cubes if cube.share_above_one > most_share or cube.greatest > most]
-    if not far:
-        return
-    values = {
-        "given": "" if scale is None else f" after division by --value-scale {scale:g}",
-        "greatest": max(cube.greatest for cube in far),
-        "scale": _propose_scale(far),
-        "or_clip": ", or to 1 to clip highlights at 1" if scale is None else "",
-    }
-    for cube in far:
-        faults.note(cube.where, Message.CUBE_FAR_OFF, **values)

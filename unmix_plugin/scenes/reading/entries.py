@@ -101,7 +101,14 @@ def read_entries(root: Path, faults: Faults, needs_cubes: bool = True) -> SceneE
     warned, noted = unfollowed_keys(scene, [frame for _, frame in transforms.frames])
     has_bands = needs_cubes or keys.wavelengths is not None
     wavelengths_nm = _read_wavelengths(keys, faults) if has_bands else None
-    materials, fwhm_nm = _read_materials(keys, faults), read_widths(keys, faults)
+    materials = keys.materials
+    if materials is not None:
+        names = materials if isinstance(materials, list) else [None]
+        are_names = names and all(isinstance(v, str) and v.strip() and v.isprintable() for v in names)
+        if not are_names or len(set(materials)) != len(materials):
+            materials = faults.note(FILE_NAME, Message.NO_MATERIALS, found=describe(materials))
+    fwhm_nm = read_widths(keys, faults)
+
     frames = []
     for where, frame in transforms.frames:
         own = read_frame_keys(frame, where, faults)
@@ -122,7 +129,7 @@ def read_entries(root: Path, faults: Faults, needs_cubes: bool = True) -> SceneE
     return SceneEntry(
         keys=keys,
         wavelengths_nm=wavelengths_nm,
-        materials=materials,
+        materials=None if materials is None else tuple(materials),
         split_lists=split_lists(keys),
         frames=tuple(frames),
         placement=placement,
@@ -152,17 +159,6 @@ def _read_wavelengths(keys: SceneKeys, faults: Faults) -> Float64[np.ndarray, " 
     except SpectrumError as error:
         return faults.note(FILE_NAME, Message.WAVELENGTHS_NO_NM, reason=error)
     return wavelengths
-
-
-def _read_materials(keys: SceneKeys, faults: Faults) -> tuple[str, ...] | None:
-    values = keys.materials
-    if values is None:
-        return None
-    names = values if isinstance(values, list) else [None]
-    are_names = names and all(isinstance(v, str) and v.strip() and v.isprintable() for v in names)
-    if not are_names or len(set(values)) != len(values):
-        return faults.note(FILE_NAME, Message.NO_MATERIALS, found=describe(values))
-    return tuple(values)
 
 
 def read_widths(keys: SceneKeys, faults: Faults) -> Float64[np.ndarray, " B"] | None:

@@ -38,11 +38,24 @@ def split_frames(
     if method == "lists" and not entry.split_lists:
         faults.note(FILE_NAME, Message.NO_SPLIT_LISTS)
         return Split((), ())
-    names = {_name_split(frame.paths) for frame in entry.frames}
+    words = [_name_split(frame.paths) for frame in entry.frames]
     if method == "lists" or (method == "auto" and entry.split_lists):
-        split = _by_lists(entry, faults)
-    elif method == "filename" or (method == "auto" and None not in names and {"train"} < names):
-        split = _by_name(entry, faults)
+        names = [
+            [frame.paths[key] for key in (CUBE_KEY, "file_path") if key in frame.paths]
+            for frame in entry.frames
+        ]
+        train, evaluation = split_by_lists(names, entry.split_lists, faults)
+        for index in sorted(train & evaluation):
+            faults.note(entry.frames[index].where, Message.IN_BOTH_SPLITS)
+        split = Split(tuple(sorted(train)), tuple(sorted(evaluation)))
+    elif method == "filename" or (method == "auto" and None not in words and {"train"} < set(words)):
+        members: dict[str | None, list[int]] = {}
+        for index, (frame, word) in enumerate(zip(entry.frames, words, strict=True)):
+            members.setdefault(word, []).append(index)
+            if word is None:
+                faults.note(frame.where, Message.NO_SPLIT_NAME)
+        validation = sorted(members.get("eval", []) + members.get("val", []))
+        split = Split(tuple(members.get("train", [])), tuple(members.get("test") or validation))
     else:
         split = _by_interval(entry, interval, faults)
     how = "split chosen by itself" if method == "auto" else f"split by {method}"
@@ -51,16 +64,6 @@ def split_frames(
     if entry.frames and not split.evaluation:
         faults.note(FILE_NAME, Message.NONE_TO_EVALUATE, how=how)
     return split
-
-
-def _by_lists(entry: SceneEntry, faults: Faults) -> Split:
-    names = [
-        [frame.paths[key] for key in (CUBE_KEY, "file_path") if key in frame.paths] for frame in entry.frames
-    ]
-    train, evaluation = split_by_lists(names, entry.split_lists, faults)
-    for index in sorted(train & evaluation):
-        faults.note(entry.frames[index].where, Message.IN_BOTH_SPLITS)
-    return Split(tuple(sorted(train)), tuple(sorted(evaluation)))
 
 
 def split_by_lists(
@@ -102,18 +105,6 @@ def _name_split(paths: dict[str, str]) -> str | None:
             if match := _SPLIT_NAME.match(word):
                 return next(name for name in _SPLIT_NAMES if match.group(1).lower().startswith(name))
     return None
-
-
-def _by_name(entry: SceneEntry, faults: Faults) -> Split:
-    members: dict[str, list[int]] = {}
-    for index, frame in enumerate(entry.frames):
-        name = _name_split(frame.paths)
-        if name is None:
-            faults.note(frame.where, Message.NO_SPLIT_NAME)
-        else:
-            members.setdefault(name, []).append(index)
-    evaluation = members.get("test") or sorted(members.get("eval", []) + members.get("val", []))
-    return Split(tuple(members.get("train", [])), tuple(evaluation))
 
 
 def _by_interval(entry: SceneEntry, interval: int, faults: Faults) -> Split:
