@@ -63,13 +63,6 @@ def _chart_labels(
     return _components(axes, links)[0], axes
 
 
-def _chart_uv(positions: Float[np.ndarray, "N 3"], axes: Int[np.ndarray, " N"]) -> Float[np.ndarray, "N 2"]:
-    """Points as they are seen along an axis each, in the positions' unit, not mirrored."""
-    right = np.roll(np.abs(_AXES), 1, axis=1)
-    up = np.cross(_AXES, right)
-    return np.stack([(positions * right[axes]).sum(axis=1), (positions * up[axes]).sum(axis=1)], axis=1)
-
-
 def _best(scores: np.ndarray, normals: np.ndarray, otherwise: np.ndarray | None = None) -> np.ndarray:
     """The axis of the highest score among those that a triangle faces; the nearest one where there is none."""
     cosines = normals @ _AXES.T
@@ -139,7 +132,10 @@ def unwrap(positions: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], t
     cut, vertices = corners.reshape(faces.shape), keys % len(positions)
     axis_of_chart = np.zeros(charts.max() + 1, dtype=np.int64)
     axis_of_chart[charts] = axes
-    flat = _chart_uv(positions[vertices], axis_of_chart[keys // len(positions)])
+    # Points as they are seen along their chart's axis, not mirrored.
+    right = np.roll(np.abs(_AXES), 1, axis=1)
+    up, chart_axes = np.cross(_AXES, right), axis_of_chart[keys // len(positions)]
+    flat = np.stack([(positions[vertices] * side[chart_axes]).sum(axis=1) for side in (right, up)], axis=1)
     # Triangles of less than about 1e-7 units of area would not be placed.
     flat = (flat / np.linalg.norm(np.diff(flat[cut[:, :2]], axis=1), axis=2).mean()).astype(np.float32)
     packer = _packed(flat, cut, charts, texture_size)

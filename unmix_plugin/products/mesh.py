@@ -188,7 +188,16 @@ def _write_mesh(
         elif kind == "obj":
             written += _write_obj(path, world, turned, looks, axis, textures)
         else:
-            written.append(_write_glb(path, world, turned, looks, axis, textures))
+            points, numbers, extras = gltf_content(world, looks, _WHAT)
+            faces, uv, pictures, arrows, colours = world.faces, None, None, turned, looks.linear_rgb
+            if textures is not None:
+                chosen, faces, uv = textures.atlas.vertices, textures.atlas.faces, textures.atlas.uv
+                points, arrows, colours = points[chosen], turned[chosen], colours[chosen]
+                numbers = {name: values[chosen] for name, values in numbers.items()}
+                pictures = textures.pictures
+            written.append(
+                write_glb(path, points, arrows, colours, faces, numbers, extras, axis, uv, pictures)
+            )
     return written
 
 
@@ -229,24 +238,6 @@ def _write_obj(
     named = (names, palette, comments)
     written = write_obj(path.with_suffix(""), *vertices, mesh.faces, materials, *named, shown)
     return [*written, *pictures]
-
-
-def _write_glb(
-    path: Path,
-    mesh: TriangleMesh,
-    normals: Float32[np.ndarray, "V 3"],
-    looks: SurfaceAppearance,
-    up: Float64[np.ndarray, "3"],
-    textures: _Textures | None,
-) -> Path:
-    positions, numbers, extras = gltf_content(mesh, looks, _WHAT)
-    faces, uv, pictures, colours = mesh.faces, None, None, looks.linear_rgb
-    if textures is not None:
-        chosen, faces, uv = textures.atlas.vertices, textures.atlas.faces, textures.atlas.uv
-        positions, normals, colours = positions[chosen], normals[chosen], colours[chosen]
-        numbers = {name: values[chosen] for name, values in numbers.items()}
-        pictures = textures.pictures
-    return write_glb(path, positions, normals, colours, faces, numbers, extras, up, uv, pictures)
 
 
 def gltf_content(

@@ -58,7 +58,20 @@ def export(job: Job, asked: Metamerism) -> list[Path]:
         job.say(LIGHT_UNKNOWN)
     with job.working("comparing colours"):
         found = _find_metamers(job.materials, asked)
-        written = [write_file(table_path, _table(found)), write_file(figure_path, _draw_metamers(found))]
+        rows = [
+            [
+                "first",
+                "second",
+                "alike in",
+                "different in",
+                *(f"CIEDE2000 in {light}" for light in found.lights),
+            ]
+        ]
+        for pair in found.pairs:
+            lights = [found.lights[index] for index in (pair.alike_in, pair.different_in)]
+            differences = [f"{value:.3f}" for value in pair.differences]
+            rows.append([found.names[pair.first], found.names[pair.second], *lights, *differences])
+        written = [write_file(table_path, csv_bytes(rows)), write_file(figure_path, _draw_metamers(found))]
     job.say(
         f"{len(found.pairs)} pairs of {len(found.names)} materials, seen in {', '.join(found.lights)} "
         f"over {found.bands}"
@@ -122,13 +135,3 @@ def _draw_metamers(found: _Metamers) -> bytes:
                 draw_swatch(page, colour, (left + index * _SWATCH, base + 0.06), _SWATCH, "none")
             page.text(left + 2 * _SWATCH + 0.08, base + 0.29, f"{difference:.1f}", fontsize=10, va="center")
     return figure_bytes(figure)
-
-
-def _table(found: _Metamers) -> bytes:
-    shown = [f"CIEDE2000 in {light}" for light in found.lights]
-    rows = [["first", "second", "alike in", "different in", *shown]]
-    for pair in found.pairs:
-        lights = [found.lights[index] for index in (pair.alike_in, pair.different_in)]
-        differences = [f"{value:.3f}" for value in pair.differences]
-        rows.append([found.names[pair.first], found.names[pair.second], *lights, *differences])
-    return csv_bytes(rows)

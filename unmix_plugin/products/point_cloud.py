@@ -229,11 +229,15 @@ def _write_point_cloud(
         **xyz_columns(turned, "n"),
         **looks.properties(),
         **{score.property: score.values(diffuse, materials.light) for score in scores},
-        **_band_columns(diffuse, materials, spectra),
     }
     comments = looks.comments("surface points of an unmix-nerf run")
     comments += [comment for score in scores for comment in score.comments(materials)]
-    if spectra != "none":
+    if spectra != "none":  # of reflectance NaN where the light is dark
+        light = materials.light if spectra == "reflectance" else None
+        values = seen_reflectance(diffuse, torch.ones(len(diffuse), dtype=diffuse.dtype), light).numpy()
+        for index, nm in enumerate(materials.bands.centers_nm):
+            name = f"{spectra}_{nm:.10g}nm".replace(".", "_")
+            vertices[name] = values[:, index].astype(np.float32)
         comments.append(f"{spectra}_NUMBERnm: the diffuse spectrum at each band")
     for path in paths:
         if path.suffix in (".las", ".laz"):
@@ -241,15 +245,3 @@ def _write_point_cloud(
         else:
             write_ply(path, vertices, comments=comments)
     return len(chosen)
-
-
-def _band_columns(
-    diffuse: Float[Tensor, "P B"], materials: Materials, spectra: Literal["none", "radiance", "reflectance"]
-) -> dict[str, Float32[np.ndarray, " P"]]:
-    """A column for each band, called such as `reflectance_450nm`; of reflectance NaN where the light is dark."""
-    if spectra == "none":
-        return {}
-    light = materials.light if spectra == "reflectance" else None
-    values = seen_reflectance(diffuse, torch.ones(len(diffuse), dtype=diffuse.dtype), light).numpy()
-    names = [f"{spectra}_{nm:.10g}nm".replace(".", "_") for nm in materials.bands.centers_nm]
-    return {name: values[:, index].astype(np.float32) for index, name in enumerate(names)}

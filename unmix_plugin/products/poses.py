@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from unmix_plugin.formats.files import make_folder, write_file
@@ -36,7 +35,10 @@ _LENS = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
 def export(job: Job, _: Poses) -> list[Path]:
     """Write transforms.json, a COLMAP model, and the pictures that both name."""
     scene = job.loaded.scene
-    pictures = _pictures_of(job, scene.views)
+    root = Path(str(job.loaded.record.summary.get("root", "")))
+    pictures = [root / _PICTURES / f"{view.name}.png" for view in scene.views]
+    if not root.is_absolute() or not all(path.is_file() for path in pictures):
+        pictures = []
     content = _poses_json(scene.views, scene.frame, "pose" in scene.fitted)
     if job.loaded.scale is not None:
         content[METRES_KEY] = job.loaded.scale.metres_per_unit
@@ -66,13 +68,6 @@ def export(job: Job, _: Poses) -> list[Path]:
     return written
 
 
-def _pictures_of(job: Job, views: Sequence[RunView]) -> list[Path]:
-    """Pictures of the scene that the run was trained on, if all of them are where they were."""
-    root = Path(str(job.loaded.record.summary.get("root", "")))
-    found = [root / _PICTURES / f"{view.name}.png" for view in views]
-    return found if root.is_absolute() and all(path.is_file() for path in found) else []
-
-
 def _poses_json(views: Sequence[RunView], frame: Normalisation, is_refined: bool) -> dict[str, Any]:
     """What the file says; `frame` leads from world to model space."""
     frames = []
@@ -97,19 +92,12 @@ def _colmap_texts(frames: Sequence[dict[str, Any]]) -> tuple[dict[str, str], int
         values = [frame.get(key, 0.0) for key in _LENS]
         model = ("FULL_OPENCV", *values, higher[0], 0.0, 0.0, 0.0) if any(higher) else ("OPENCV", *values)
         camera = cameras.setdefault((model[0], frame["w"], frame["h"], *model[1:]), len(cameras) + 1)
-        quaternion, translation = _world_to_camera(np.array(frame["transform_matrix"])[:3])
-        numbers = " ".join(f"{value:.17g}" for value in (*quaternion, *translation))
+        pose = np.array(frame["transform_matrix"])[:3]
+        world_to_camera = (pose[:, :3] @ _FLIP).T
+        x, y, z, w = Rotation.from_matrix(world_to_camera).as_quat()
+        numbers = " ".join(f"{value:.17g}" for value in (w, x, y, z, *(-world_to_camera @ pose[:, 3])))
         name = frame["file_path"].removeprefix(f"{_PICTURES}/")
         images.append(f"{len(images) + 1} {numbers} {camera} {name}\n\n")
     lines = [f"{number} {' '.join(map(str, key))}\n" for key, number in cameras.items()]
     texts = {"cameras.txt": "".join(lines), "images.txt": "".join(images), "points3D.txt": ""}
     return texts, len(frames) - len(images)
-
-
-def _world_to_camera(
-    pose: Float64[np.ndarray, "3 4"],
-) -> tuple[Float64[np.ndarray, "4"], Float64[np.ndarray, "3"]]:
-    """Quaternion w, x, y, z and translation of a camera to world with OpenGL's axes."""
-    rotation = (pose[:, :3] @ _FLIP).T
-    x, y, z, w = Rotation.from_matrix(rotation).as_quat()
-    return np.array([w, x, y, z]), -rotation @ pose[:, 3]

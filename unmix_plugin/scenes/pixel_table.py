@@ -107,9 +107,8 @@ class PixelTable:
         """Hold all pixels, as they are stored or as components, or else a pool of them; gives the notes."""
         budget = None if memory_gb is None else int(_GIVEN_SHARE * memory_gb * _GIB)
         if memory_gb is None and (available := available_bytes(device)) is not None:
-            budget = int(
-                _USABLE_SHARE * (available // processes_here() if device.type == "cpu" else available)
-            )
+            num_sharing = processes_here() if device.type == "cpu" else 1
+            budget = int(_USABLE_SHARE * (available // num_sharing))
         total = sum(block.num_bytes for block in self.blocks)
         fits = budget is None or total <= budget
         found = {} if components == "none" or (components == "auto" and fits) else self._projected(components)

@@ -380,9 +380,14 @@ def scene_truth(scene: Scene) -> _SceneTruth:
     if scene.endmembers is not None:
         light = np.ones(len(scene.wavelengths_nm)) if scene.illuminant is None else scene.illuminant
         endmembers = torch.from_numpy(scene.endmembers * light)
-    return _SceneTruth(
-        Bands.of(scene.wavelengths_nm), _num_materials(scene), endmembers, scene.material_names
-    )
+    known = scene.endmembers if scene.material_names is None else scene.material_names
+    if known is not None:
+        num_materials = len(known)
+    else:  # as many as labels of evaluation views name
+        labels = (found for index in scene.eval_indices if (found := scene.labels(index)) is not None)
+        greatest = (int(one.max(where=one != NOTHING_ID, initial=0)) for one in labels)
+        num_materials = max((label + 1 for label in greatest), default=0)
+    return _SceneTruth(Bands.of(scene.wavelengths_nm), num_materials, endmembers, scene.material_names)
 
 
 def view_truth(scene: Scene, index: int) -> ViewTruth:
@@ -402,15 +407,6 @@ def view_truth(scene: Scene, index: int) -> ViewTruth:
 def finite_or_none(figures: dict[str, float]) -> dict[str, float | None]:
     """Figures as JSON has them: null where there is no truth, or for the infinite PSNR of equal images."""
     return {name: value if math.isfinite(value) else None for name, value in figures.items()}
-
-
-def _num_materials(scene: Scene) -> int:
-    """Materials that labels of evaluation views may name."""
-    for known in (scene.material_names, scene.endmembers):
-        if known is not None:
-            return len(known)
-    labels = (found for index in scene.eval_indices if (found := scene.labels(index)) is not None)
-    return max((int(one.max(where=one != NOTHING_ID, initial=0)) + 1 for one in labels), default=0)
 
 
 def _tensor(array: np.ndarray | None) -> Tensor | None:

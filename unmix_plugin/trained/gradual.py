@@ -39,7 +39,10 @@ class FrameRender:
         self._before = before if isinstance(before, ModelView) else None
         self._subpixels, self._is_finished = subpixels, is_finished
         self._num_pixels = camera.width * camera.height
-        self._stride = _coprime_stride(self._num_pixels)
+        self._stride = max(1, round(self._num_pixels * 0.6180339887))
+        """A step through the pixels that meets each once and that spreads any run of them evenly."""
+        while math.gcd(self._stride, self._num_pixels) != 1:
+            self._stride += 1
         self.num_rays = self._num_pixels * subpixels**2
         """Rays of the whole view."""
         self._rays_done = 0
@@ -115,14 +118,6 @@ def numbers_per_pixel(scene: RenderableScene) -> int:
     if materials is None:
         return 4 * len(scene.outputs)
     return 2 + 2 * len(materials.endmembers) + len(materials.specular_spectra)
-
-
-def _coprime_stride(count: int) -> int:
-    """A step through `count` pixels that meets each once and that spreads any run of them evenly."""
-    stride = max(1, round(count * 0.6180339887))
-    while math.gcd(stride, count) != 1:
-        stride += 1
-    return stride
 
 
 def wants_more(view: RenderedView) -> bool:

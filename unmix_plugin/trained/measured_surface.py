@@ -86,8 +86,9 @@ class MeasuredSurface:
         """Of the triangles, square units of the world."""
         return self.mesh.areas() / self.scene.frame.scale**2
 
-    def _shares(self, region: Region, name: str) -> Float64[np.ndarray, "F 3"]:
-        """How much of each third of a triangle, that of a corner, is in a region: 0 to 1."""
+    def measure(self, region: Region, name: str) -> MeasuredRegion:
+        """What a region is; a ConfigError where it has nothing of the surface, or the scene no such material."""
+        # How much of each third of a triangle, that of a corner, is in the region: 0 to 1.
         faces, names = self.mesh.faces, self.scene.materials.names
         if isinstance(region, OfMaterial):
             if region.material >= len(names):
@@ -95,17 +96,15 @@ class MeasuredSurface:
                     f"the region {name} can't be found: the scene has no material {region.material}; it has "
                     f"{len(names)}"
                 )
-            return (self._materials == region.material)[faces].astype(np.float64)
-        corners, weights = self.mesh.vertices[faces], np.array(_PARTS) / 6
-        points = np.einsum("pc,fcx->fpx", weights, corners).reshape(-1, 3)
-        inside = points_in(self.scene, region, torch.from_numpy(points).float())
-        return inside.reshape(len(faces), len(_PARTS)) @ weights / weights.sum(axis=0)
+            fractions = (self._materials == region.material)[faces].astype(np.float64)
+        else:
+            corners, weights = self.mesh.vertices[faces], np.array(_PARTS) / 6
+            points = np.einsum("pc,fcx->fpx", weights, corners).reshape(-1, 3)
+            inside = points_in(self.scene, region, torch.from_numpy(points).float())
+            fractions = inside.reshape(len(faces), len(_PARTS)) @ weights / weights.sum(axis=0)
 
-    def measure(self, region: Region, name: str) -> MeasuredRegion:
-        """What a region is; a ConfigError where it has nothing of the surface, or the scene no such material."""
-        shares = self._shares(region, name)
-        of_corners = shares * (self.areas / 3)[:, None]
-        weights = np.bincount(self.mesh.faces.ravel(), of_corners.ravel(), len(self.mesh.vertices))
+        of_corners = fractions * (self.areas / 3)[:, None]
+        weights = np.bincount(faces.ravel(), of_corners.ravel(), len(self.mesh.vertices))
         area = float(weights.sum())
         if area <= 0:
             world = self.scene.frame.to_world(self.mesh.vertices).round(3)
@@ -119,7 +118,7 @@ class MeasuredSurface:
         mean = share @ spectra
         spread = np.sqrt(share @ (spectra - mean) ** 2)
         abundances = share @ self._abundances.double().numpy()
-        return MeasuredRegion(area, mean, spread, abundances, shares.mean(axis=1) > 0.5, weights)
+        return MeasuredRegion(area, mean, spread, abundances, fractions.mean(axis=1) > 0.5, weights)
 
 
 def points_in(

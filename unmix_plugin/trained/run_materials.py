@@ -79,21 +79,19 @@ def shown_matches(
     known = dict(
         zip(library.names, library.resampled(bands) * (1.0 if light is None else light), strict=True)
     )
-    return [
-        [ShownMatch(match, _as_bright(known[match.name], spectrum)) for match in matches]
-        for spectrum, matches in zip(spectra, found, strict=True)
-    ]
+    shown: list[list[ShownMatch]] = []
+    for spectrum, matches in zip(spectra, found, strict=True):
+        shown.append([])
+        for match in matches:
+            lit = known[match.name]
+            shared = np.isfinite(lit)
+            power = float(lit[shared] @ lit[shared])
+            gain = float(lit[shared] @ spectrum[shared]) / power if power > 0 else 0.0
+            shown[-1].append(ShownMatch(match, lit * gain))
+    return shown
 
 
 def match_json(match: LibraryMatch) -> dict[str, Any]:
     """A match as JSON has it."""
     given = {"name": match.name, "angle_rad": match.angle_rad}
     return {**given, "bands_compared": match.num_bands, "source": match.source}
-
-
-def _as_bright(
-    lit: Float64[np.ndarray, " B"], spectrum: Float[np.ndarray, " B"]
-) -> Float64[np.ndarray, " B"]:
-    shared = np.isfinite(lit)
-    power = float(lit[shared] @ lit[shared])
-    return lit * (float(lit[shared] @ spectrum[shared]) / power if power > 0 else 0.0)

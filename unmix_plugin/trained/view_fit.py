@@ -166,17 +166,19 @@ def misfits(fits: Sequence[ViewFit]) -> dict[str, Misfit]:
             outlying.append(fit)
     if len(outlying) > _MOST * len(fits):
         return {}
-    return {fit.name: _reason(fit, sharpness) for fit in outlying}
 
-
-def _reason(fit: ViewFit, sharpness: float) -> Misfit:
-    if abs(np.log(max(fit.factor, 1e-6))) > _LEAST_FACTOR and fit.error_of_factor < _EXPLAINS * fit.error:
-        return Misfit.EXPOSURE
-    if fit.sharpness < _BLURRED * sharpness:
-        return Misfit.BLUR
-    if fit.error_of_shift < _EXPLAINS * fit.error or fit.spread > _ALL_OVER:
-        return Misfit.POSE
-    return Misfit.CONTENT
+    reasons: dict[str, Misfit] = {}
+    for fit in outlying:
+        is_brighter = abs(np.log(max(fit.factor, 1e-6))) > _LEAST_FACTOR
+        if is_brighter and fit.error_of_factor < _EXPLAINS * fit.error:
+            reasons[fit.name] = Misfit.EXPOSURE
+        elif fit.sharpness < _BLURRED * sharpness:
+            reasons[fit.name] = Misfit.BLUR
+        elif fit.error_of_shift < _EXPLAINS * fit.error or fit.spread > _ALL_OVER:
+            reasons[fit.name] = Misfit.POSE
+        else:
+            reasons[fit.name] = Misfit.CONTENT
+    return reasons
 
 
 def describe_misfits(found: dict[str, Misfit]) -> list[str]:

@@ -238,7 +238,11 @@ class Session:
         kept = view.pose
         self.client.camera.on_update(self._moved)
         if kept is None:
-            self._fit_width()
+            camera = self.client.camera
+            with suppress(ConfigError):
+                pose = pose_from(camera)
+                if pose.aspect < 1:  # on a phone's screen, as much across as otherwise from top to bottom
+                    camera.fov = 2 * math.atan(math.tan(pose.fov / 2) / pose.aspect)
             self._moved(self.client.camera)
         else:
             self.services.loop.change(view, pose=kept)
@@ -367,14 +371,6 @@ class Session:
             self.client.camera.position = pose.position
             self.client.camera.look_at = point_ahead(camera, self.services.source.record.scene_box)
             self.client.camera.fov = pose.fov
-
-    def _fit_width(self) -> None:
-        """On a screen higher than wide, as a phone's, see as much across as otherwise from top to bottom."""
-        camera = self.client.camera
-        with suppress(ConfigError):
-            pose = pose_from(camera)
-            if pose.aspect < 1:
-                camera.fov = 2 * math.atan(math.tan(pose.fov / 2) / pose.aspect)
 
     def show_busy(self, what: str) -> None:
         """Show what is being drawn, in place of what the last picture's colours mean, until it is there."""

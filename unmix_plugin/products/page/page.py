@@ -46,7 +46,7 @@ from unmix_plugin.spectral.maps.indices import NAMED_INDICES, named_formula
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.measured_surface import MeasuredSurface
 from unmix_plugin.trained.run_materials import endmember_colours, relit
-from unmix_plugin.trained.run_views import RunView, directions_to_world, world_up
+from unmix_plugin.trained.run_views import directions_to_world, world_up
 from unmix_plugin.trained.surface import look_at
 from unmix_plugin.trained.surface_mesh import TriangleMesh, vertex_areas
 from unmix_plugin.trained.trained_scene import TrainedScene
@@ -170,6 +170,19 @@ def _page(job: Job, content: PageContent, known: _KnownSpectra, title: str) -> b
     arrays, layout = _packed({**content.arrays, "known": known.steps})
     scale = job.loaded.scale
     name = title or job.loaded.scene_name
+
+    cameras, views = [], job.views("all")
+    for view in views[:: -(-len(views) // _MOST_CAMERAS)]:
+        pose, size = view.camera.camera_to_world[0].double().cpu().numpy(), view.camera.size(0)
+        camera = {
+            "name": view.name,
+            "position": job.frame.to_world(pose[None, :, 3])[0].tolist(),
+            "axes": directions_to_world(job.frame, pose[:, :3].T).tolist(),
+            "size": list(size),
+            "focal_px": view.camera.focal_px[0].tolist(),
+        }
+        cameras.append(camera)
+
     facts = {
         "title": name,
         "subtitle": f"{job.loaded.config.method_name}, run {job.loaded.folder.path.name}",
@@ -182,7 +195,7 @@ def _page(job: Job, content: PageContent, known: _KnownSpectra, title: str) -> b
         "regions": [],
         **content.facts,
         "up": rounded(world_up(job.loaded.scene.views, job.frame)),
-        "cameras": _camera_facts(job.views("all"), job.frame),
+        "cameras": cameras,
     }
     return _fill(facts, arrays, content.pictures)
 
@@ -272,20 +285,6 @@ def _spectral_facts(materials: Materials | None, recorded: Sequence[float] | Non
         ],
         "colour_map": _colour_map(),
     }
-
-
-def _camera_facts(views: list[RunView], frame: Normalisation) -> list[dict[str, Any]]:
-    """Where the cameras stand, in the world's axes."""
-    cameras = []
-    for view in views[:: -(-len(views) // _MOST_CAMERAS)]:
-        pose, size = view.camera.camera_to_world[0].double().cpu().numpy(), view.camera.size(0)
-        place = {
-            "position": frame.to_world(pose[None, :, 3])[0].tolist(),
-            "axes": directions_to_world(frame, pose[:, :3].T).tolist(),
-        }
-        focal_px = view.camera.focal_px[0].tolist()
-        cameras.append({"name": view.name, **place, "size": list(size), "focal_px": focal_px})
-    return cameras
 
 
 def _vertex_arrays(

@@ -106,24 +106,20 @@ def _map(
         )
     camera, info = map_camera(scene, scale, direction, options.pixel_size)
     if options.epsg is not None:
-        _require_coordinate_system(options.epsg, scale, direction)
+        if not _PROJECTED_CODES[0] <= options.epsg <= _PROJECTED_CODES[1] or options.epsg // 1000 == 4:
+            raise ConfigError(
+                f"--epsg {options.epsg} is no projected coordinate system; expected a code such as 32632 (UTM zone 32N)"
+            )
+        if direction != "top":
+            raise ConfigError(f"--epsg is for maps from above; map:{direction} has no east and north")
+        if scale is None or scale.metres_per_unit != 1:
+            raise ConfigError(
+                "--epsg needs a world in metres, as geo-referenced poses have; this run's scale is another or "
+                "unknown: leave --epsg out"
+            )
         info = replace(info, epsg=options.epsg)
     name = re.sub(r"[^\w-]+", "_", f"map_{direction}")
     return RenderCameras((RunView(name, camera),), False, None, info)
-
-
-def _require_coordinate_system(epsg: int, scale: Scale | None, direction: str) -> None:
-    if not _PROJECTED_CODES[0] <= epsg <= _PROJECTED_CODES[1] or epsg // 1000 == 4:
-        raise ConfigError(
-            f"--epsg {epsg} is no projected coordinate system; expected a code such as 32632 (UTM zone 32N)"
-        )
-    if direction != "top":
-        raise ConfigError(f"--epsg is for maps from above; map:{direction} has no east and north")
-    if scale is None or scale.metres_per_unit != 1:
-        raise ConfigError(
-            "--epsg needs a world in metres, as geo-referenced poses have; this run's scale is another or unknown: "
-            "leave --epsg out"
-        )
 
 
 def _path(name: str, cameras: Cameras) -> RenderCameras:

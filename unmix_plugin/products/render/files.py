@@ -374,14 +374,6 @@ def _envi(output: Output, path: Path, setting: RenderSetting) -> Iterator[RowsSi
         yield lambda rows: add(rows.values[output.name].reshape(-1, *shape[1:]))
 
 
-def _wavelengths(output: Output, setting: RenderSetting) -> tuple[Sequence[float], Sequence[float]]:
-    """Centre of each channel, nm, where each is one band, and the widths where they are known."""
-    bands = setting.bands.get(output.name)
-    if bands is None:
-        return output.centers_nm, ()
-    return bands.centers_nm.tolist(), () if bands.fwhm_nm is None else bands.fwhm_nm.tolist()
-
-
 @contextmanager
 def _tif(output: Output, path: Path, setting: RenderSetting) -> Iterator[RowsSink]:
     """Numbers as TIFF, a band after the other under its name; of a map as GeoTIFF."""
@@ -392,7 +384,11 @@ def _tif(output: Output, path: Path, setting: RenderSetting) -> Iterator[RowsSin
     if output.nothing is not None:
         tags.append((_GDAL_NODATA, 2, len(str(output.nothing)) + 1, str(output.nothing), True))
     names = list(setting.channels.get(output.name, (output.name,)))
-    tags.append(gdal_metadata(names, *_wavelengths(output, setting)))
+    # Centre of each channel, nm, where each is one band, and the widths where they are known.
+    bands = setting.bands.get(output.name)
+    centers_nm = output.centers_nm if bands is None else bands.centers_nm.tolist()
+    fwhm_nm = () if bands is None or bands.fwhm_nm is None else bands.fwhm_nm.tolist()
+    tags.append(gdal_metadata(names, centers_nm, fwhm_nm))
     # Which band is red, green and blue; or the colour of each id.
     kinds: dict[OutputKind, str] = {
         **dict.fromkeys(("srgb", "linear", "picture"), "rgb"),

@@ -104,7 +104,16 @@ class ReportViews:
         psnr_db = self.evaluation.add(truth, view)["psnr"]
         labels = None if truth.counted_labels is None else truth.counted_labels.numpy()
         measured = eight_bits(picture(truth.spectra, truth.opacity, bands))
-        self.shown.append(_ShownView(*given, measured, self._count_error(view, truth), labels, psnr_db))
+
+        difference = as_numpy(truth.shown(view).clamp(0, 1)) - as_numpy(truth.spectra)
+        foreground = truth.shows_matter.numpy()
+        self._squares += (difference[foreground] ** 2).sum(axis=0)
+        self._offsets += difference[foreground].sum(axis=0)
+        self._pixels += int(foreground.sum())
+        seen = np.maximum(as_numpy(view.coverage), as_numpy(truth.opacity)) > 0.01
+        counted = (seen & truth.valid.numpy()).astype(np.float64)
+        error = as_bytes(paint(_ERROR, np.sqrt((difference**2).mean(axis=-1)), counted).over()[:, :, 0])
+        self.shown.append(_ShownView(*given, measured, error, labels, psnr_db))
 
     @property
     def proportions(self) -> Float64[np.ndarray, " K"]:
@@ -129,16 +138,6 @@ class ReportViews:
         """Views with a PSNR, the lowest first."""
         known = [view for view in self.shown if math.isfinite(view.psnr_db)]
         return sorted(known, key=lambda view: view.psnr_db)
-
-    def _count_error(self, view: PredictedView, truth: ViewTruth) -> _EightBits:
-        difference = as_numpy(truth.shown(view).clamp(0, 1)) - as_numpy(truth.spectra)
-        matter = truth.shows_matter.numpy()
-        self._squares += (difference[matter] ** 2).sum(axis=0)
-        self._offsets += difference[matter].sum(axis=0)
-        self._pixels += int(matter.sum())
-        seen = np.maximum(as_numpy(view.coverage), as_numpy(truth.opacity)) > 0.01
-        counted = (seen & truth.valid.numpy()).astype(np.float64)
-        return as_bytes(paint(_ERROR, np.sqrt((difference**2).mean(axis=-1)), counted).over()[:, :, 0])
 
 
 class _CaptionedPicture(NamedTuple):

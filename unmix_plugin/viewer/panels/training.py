@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from unmix_plugin.engine.training.progress import TrainingStatus
 from unmix_plugin.engine.training.training_control import SHARE_BOUNDS
 from unmix_plugin.viewer.page import Chart, Line, number_of, table
 from unmix_plugin.viewer.session import Session
@@ -41,7 +40,18 @@ class TrainingPanel:
     def _tick(self) -> None:
         control, status = self._control, self._control.status
         self._pause.label = "resume" if control.is_paused else "pause"
-        self._state.content = table(_rows(status, self._condition(), control.is_running))
+        rows = [("training", self._condition())]
+        if status is not None:
+            rows += [
+                ("step", f"{status.step}, {100 * status.progress:.0f} %"),
+                ("loss", f"{status.loss:.4g}"),
+                ("PSNR of the batch", "-" if status.psnr is None else f"{status.psnr:.2f} dB"),
+            ]
+        if status is not None and control.is_running:
+            seconds = status.seconds_left
+            rows.append(("speed", f"{status.rays_per_second / 1000:.1f} k rays/s"))
+            rows.append(("time left", "-" if seconds is None else f"{seconds:.0f} s of training"))
+        self._state.content = table(rows)
         for steering in self._steering:
             steering.disabled = not control.is_running
         self._bar.value = 0.0 if status is None else 100 * status.progress
@@ -84,18 +94,3 @@ class TrainingPanel:
     def _change_share(self) -> None:
         device = self._control.device
         device.viewing_share = number_of(self._share, device.viewing_share)
-
-
-def _rows(status: TrainingStatus | None, condition: str, is_running: bool) -> list[tuple[str, str]]:
-    rows = [("training", condition)]
-    if status is not None:
-        psnr, left = status.psnr, status.seconds_left
-        rows += [
-            ("step", f"{status.step}, {100 * status.progress:.0f} %"),
-            ("loss", f"{status.loss:.4g}"),
-            ("PSNR of the batch", "-" if psnr is None else f"{psnr:.2f} dB"),
-        ]
-        if is_running:
-            rows.append(("speed", f"{status.rays_per_second / 1000:.1f} k rays/s"))
-            rows.append(("time left", "-" if left is None else f"{left:.0f} s of training"))
-    return rows
