@@ -472,14 +472,12 @@ class Capture:
     """What is odd about the folder, one sentence each."""
     warnings: tuple[str, ...] = ()
     """What may make values, wavelengths or geometry wrong, one sentence each: reports begin with it."""
-    unreadable: tuple[tuple[str, str], ...] = ()
-    """Names of views whose files can't be opened, and why."""
+    unreadable: Mapping[str, Remark] = field(default_factory=dict)
+    """Why files of views can't be opened, by the names of these."""
     no_poses: str = ""
     """Why the layout has no poses that can be used, for people."""
 
     @property
     def names(self) -> list[str]:
         """Of all views, those that can't be opened too, in their order."""
-        return sorted(
-            [*(view.name for view in self.views), *(name for name, _ in self.unreadable)], key=natural_order
-        )
+        return sorted([*(view.name for view in self.views), *self.unreadable], key=natural_order)

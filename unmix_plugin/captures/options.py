@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from unmix_plugin.captures.cube import Axes, Capture, ReadOptions
-from unmix_plugin.errors import CaptureError, ConfigError
+from unmix_plugin.errors import CaptureError, ConfigError, did_you_mean
 
 _LAYOUTS = {
     "cubes": "cubes:find_cubes",
@@ -106,6 +106,29 @@ class ProcessOptions:
     """Views to keep although they look spoilt: black, overexposed, blurred, with another view's pose."""
     overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Replace a scene that this command made in the output folder."""
+
+
+def check_options(options: ProcessOptions) -> None:
+    """Refuse what no capture makes right. Raises ConfigError: a layout that is none, options that don't go together, or
+    a number out of its range."""
+    if options.layout in GONE_LAYOUTS:
+        raise ConfigError(f"the layout '{options.layout}' is no longer read: {GONE_LAYOUTS[options.layout]}")
+    if options.layout not in LAYOUTS:
+        raise ConfigError(
+            f"'{options.layout}' is not a layout; expected one of {', '.join(LAYOUTS)}"
+            + did_you_mean(options.layout, LAYOUTS, form="; {}")
+        )
+    if options.white is not None and options.white_rectangle is not None:
+        raise ConfigError("--white and --white-rectangle both name a white reference; give one of them")
+    if options.white_reflectance != "1" and options.white is None and options.white_rectangle is None:
+        raise ConfigError("--white-reflectance needs a white reference: --white or --white-rectangle")
+    for name, number in (("--bin-pixels", options.bin_pixels), ("--bin-bands", options.bin_bands)):
+        if number < 1:
+            raise ConfigError(f"{name} {number}: expected 1 or more")
+    if options.saturation is not None and not 0 < options.saturation < float("inf"):
+        raise ConfigError(f"--saturation {options.saturation:g}: expected a stored number above 0")
+    if not options.max_noise > 0:
+        raise ConfigError(f"--max-noise {options.max_noise:g}: expected a share above 0")
 
 
 def parse_mosaic(text: str | None) -> tuple[int, int] | None:

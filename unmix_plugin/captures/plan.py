@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
-from unmix_plugin import __version__
 from unmix_plugin.captures.calibration.bands import BandChoice, stated_bands, without_bad, without_unlit
 from unmix_plugin.captures.calibration.calibration import Calibration, Raster
 from unmix_plugin.captures.calibration.exposures import (
@@ -42,8 +41,8 @@ from unmix_plugin.captures.decide import (
     saturated_bands,
     usual_pixels,
 )
-from unmix_plugin.captures.options import MaskKind, ProcessOptions, plain_options
-from unmix_plugin.captures.poses.pose_set import PosedCamera, reading
+from unmix_plugin.captures.options import MaskKind, ProcessOptions
+from unmix_plugin.captures.poses.pose_set import PosedCamera
 from unmix_plugin.captures.report import Code, Remark
 from unmix_plugin.captures.sample import (
     PixelSample,
@@ -58,7 +57,6 @@ from unmix_plugin.captures.spoilt import judge_values
 from unmix_plugin.captures.writing.view_files import BackgroundRule, ViewRecipe, alpha_picture
 from unmix_plugin.engine.sampling import evenly_spaced
 from unmix_plugin.scenes.backdrops import Backdrop, judge_backdrop
-from unmix_plugin.scenes.reading.faults import sha256_of
 from unmix_plugin.spectral.bands import Bands
 
 _BACKDROP_VIEWS = 12
@@ -173,35 +171,6 @@ class Plan:
         scale = {"calibrated": self.scale.value, "evidence": self.scale.evidence}
         return {"scale": scale, "mask": self.mask, "sensors": each}
 
-    def fingerprint(self, options: ProcessOptions) -> dict[str, Any]:
-        """What must be the same for views to be gone on with: options, decisions and input files."""
-        free = [
-            "output_dir",
-            "overwrite",
-            "poses",
-            "marker_size",
-            "marker_family",
-            "known_distance",
-            "angles",
-        ]
-        fixed = {key: value for key, value in plain_options(options).items() if key not in free}
-        files = [path for view in self.views for path in input_files(view)] + list(self.option_files)
-        stamps = []  # path, size and time of change, which tell quickly whether a file is still the same
-        for file in _files_of(files):
-            with reading(file):
-                facts = file.stat()
-            stamps.append([os.fspath(file.absolute()), facts.st_size, facts.st_mtime_ns])
-        # What transforms.json states may change while its poses, which views don't depend on, are mended.
-        stated = [view.cube.linear for view in self.views if view.cube.linear is not None]
-        return {
-            "version": __version__,
-            "options": fixed,
-            "decisions": self.decisions,
-            "bands": {name: sensor.centers_nm.tolist() for name, sensor in self.sensors.items()},
-            "gains": sorted({repr((one.gains.tolist(), one.offsets.tolist())) for one in stated}),
-            "files": stamps,
-        }
-
 
 def make_plan(
     capture: Capture,
@@ -230,32 +199,13 @@ def make_plan(
         sensors[name] = plan_sensor(same, options, given, all_views=every, cameras=cameras)
     sensors = with_one_exposure(sensors, {name: same[0].cube for name, same in by_sensor.items()})
     left_out = {name: remark for sensor in sensors.values() for name, remark in sensor.left_out.items()}
-    sound = {name: [view for view in same if view.name not in left_out] for name, same in by_sensor.items()}
 
     meanings = [sensor.meaning for sensor in sensors.values()]
     usual = [sensor.usual_sample.ravel() for sensor in sensors.values()]
     scale = choose_scale(meanings, np.concatenate(usual), options.scale)
 
-    is_rig = any(view.shot for view in views)
-    without = []
-    if options.mask in ("auto", "files"):
-        # Files of a view tell its matter: an alpha channel, or its mask where that is asked for.
-        takes_masks = options.mask == "files"
-        without = [
-            view.name
-            for view in views
-            if not (view.alpha or alpha_picture(view) or (takes_masks and view.mask is not None))
-        ]
-    names = [view.name for view in views]
-    mask, remarks_on_mask = choose_mask(options.mask, names, without, is_rig)
-    backgrounds = _backgrounds(mask, sensors, sound, scale.value)
-    if mask == "auto" and None in backgrounds.values():  # frames with alpha and without don't go together
-        backgrounds, mask = dict.fromkeys(sensors), "none"
-    if mask == "auto":
-        found = [each.in_words for each in backgrounds.values() if isinstance(each, Backdrop)]
-        remarks_on_mask.append(Remark.of(Code.BACKDROP_FOUND, backdrops=", ".join(found)))
-    if options.mask == "auto" and mask == "none" and not is_rig:
-        remarks_on_mask.append(Remark.of(Code.NO_MASK_FOUND))
+    sound = {name: [view for view in same if view.name not in left_out] for name, same in by_sensor.items()}
+    mask, backgrounds, remarks_on_mask = _decide_mask(options.mask, views, sensors, sound, scale.value)
     recipes = {
         name: ViewRecipe(
             sensor.calibration,
@@ -266,6 +216,7 @@ def make_plan(
         )
         for name, sensor in sensors.items()
     }
+
     files = [(view.name, file) for view in views for file in (view.cube, *view.references)]
     files += [(file.path.name, file) for file in given.files]
     texts = (options.wavelengths or "", options.white_reflectance)  # numbers, or the name of a table
@@ -281,7 +232,7 @@ def make_plan(
             *(Remark.of(Code.NOTE, text=text) for text in capture.notes),
             *(Remark.of(Code.CAPTURE_WARNING, text=text) for text in capture.warnings),
             *(remark for sensor in sensors.values() for remark in sensor.remarks),
-            *doubts_of_values(sensors, scale),
+            *_doubts_of_references(sensors, scale),
             *remarks_on_mask,
             *_doubts_of_kinds(sensors, scale, views),
             *_remarks_on_pictures([view.cube for view in views]),
@@ -296,6 +247,48 @@ def make_plan(
         option_files=(*(path for file in given.files for path in file.files), *map(Path, tables)),
         left_out=left_out,
     )
+
+
+def _decide_mask(
+    asked: MaskKind,
+    views: Sequence[CaptureView],
+    sensors: Mapping[str, SensorPlan],
+    sound: Mapping[str, Sequence[CaptureView]],
+    scale: float,
+) -> tuple[MaskKind, dict[str, BackgroundRule | Backdrop | None], list[Remark]]:
+    """What tells foreground from background, the background of each sensor's views where values tell it (a colour that
+    is asked for, or a backdrop), and what a user should know of that.
+
+    Args:
+        sound: Views of each sensor that are not spoilt.
+    """
+    is_rig = any(view.shot for view in views)
+    without = []
+    if asked in ("auto", "files"):
+        # Files of a view tell its foreground: an alpha channel, or its mask where that is asked for.
+        without = [
+            view.name
+            for view in views
+            if not (view.alpha or alpha_picture(view) or (asked == "files" and view.mask is not None))
+        ]
+    mask, remarks = choose_mask(asked, [view.name for view in views], without, is_rig)
+    backgrounds: dict[str, BackgroundRule | Backdrop | None] = dict.fromkeys(sensors)
+    for name, sensor in sensors.items():
+        calibration, sample = sensor.calibration, sensor.sample / np.float32(scale)
+        if mask in ("white", "black"):
+            backgrounds[name] = background_rule(mask, border_pixels(sound[name], calibration, scale), sample)
+        elif mask == "auto":
+            some = [sound[name][index] for index in evenly_spaced(len(sound[name]), _BACKDROP_VIEWS)]
+            rows = (rows_behind(view, calibration, scale) for view in some)
+            backgrounds[name] = judge_backdrop(rows, sample)
+    if mask == "auto" and None in backgrounds.values():  # frames with alpha and without don't go together
+        backgrounds, mask = dict.fromkeys(sensors), "none"
+    if mask == "auto":
+        found = [each.in_words for each in backgrounds.values() if isinstance(each, Backdrop)]
+        remarks.append(Remark.of(Code.BACKDROP_FOUND, backdrops=", ".join(found)))
+    if asked == "auto" and mask == "none" and not is_rig:
+        remarks.append(Remark.of(Code.NO_MASK_FOUND))
+    return mask, backgrounds, remarks
 
 
 def plan_sensor(
@@ -435,7 +428,7 @@ def with_one_exposure(sensors: dict[str, SensorPlan], first: dict[str, Cube]) ->
     return brought
 
 
-def doubts_of_values(sensors: Mapping[str, SensorPlan], scale: Scale) -> Iterator[Remark]:
+def _doubts_of_references(sensors: Mapping[str, SensorPlan], scale: Scale) -> Iterator[Remark]:
     """What may be wrong with the references, by the values that come of them."""
     has_white = any(sensor.calibration.references.whites for sensor in sensors.values())
     yield from doubts_of_scale([sensor.meaning for sensor in sensors.values()], scale, has_white)
@@ -466,25 +459,6 @@ def _colours_of(sensor: SensorPlan, scale: float) -> Float32[np.ndarray, "c 3"]:
     return to_rgb / np.float32(white) if white > 0 else to_rgb
 
 
-def _backgrounds(
-    mask: MaskKind,
-    sensors: Mapping[str, SensorPlan],
-    views: Mapping[str, Sequence[CaptureView]],
-    scale: float,
-) -> dict[str, BackgroundRule | Backdrop | None]:
-    """What tells the background of each sensor's views, if values do: a colour that is asked for, or a backdrop."""
-    found: dict[str, BackgroundRule | Backdrop | None] = dict.fromkeys(sensors)
-    for name, sensor in sensors.items():
-        calibration, sample = sensor.calibration, sensor.sample / np.float32(scale)
-        if mask in ("white", "black"):
-            border = border_pixels(views[name], calibration, scale)
-            found[name] = background_rule(mask, border, sample)
-        elif mask == "auto":
-            some = [views[name][index] for index in evenly_spaced(len(views[name]), _BACKDROP_VIEWS)]
-            found[name] = judge_backdrop((rows_behind(view, calibration, scale) for view in some), sample)
-    return found
-
-
 def _remarks_on_pictures(files: Sequence[Cube]) -> Iterator[Remark]:
     """Encoding, order of colours and orientation; none where there is no picture."""
     pictures = [file for file in files if file.reader == "picture"]
@@ -498,27 +472,3 @@ def _remarks_on_pictures(files: Sequence[Cube]) -> Iterator[Remark]:
     turned = sum(file.orientation != 1 for file in files)
     if turned:
         yield Remark.of(Code.ORIENTATION_IGNORED, turned=turned, files=len(files))
-
-
-# The files that a scene is made of.
-
-
-def input_files(view: CaptureView) -> list[Path]:
-    """Every file that a view is made of."""
-    more = [path for path in (view.picture, view.mask, view.labels) if path is not None]
-    return [*view.cube.files, *more, *(path for file in view.references for path in file.files)]
-
-
-def hashes(paths: Iterable[Path]) -> list[dict[str, Any]]:
-    """Path, size and SHA-256 of each file. CaptureError where one can't be read."""
-    found = []
-    for file in _files_of(paths):
-        with reading(file):
-            found.append({"path": os.fspath(file), "bytes": file.stat().st_size, "sha256": sha256_of(file)})
-    return found
-
-
-def _files_of(paths: Iterable[Path]) -> Iterator[Path]:
-    """Files, and those of a folder that a reader takes as one."""
-    for path in paths:
-        yield from sorted(child for child in path.iterdir() if child.is_file()) if path.is_dir() else [path]

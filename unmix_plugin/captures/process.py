@@ -21,8 +21,8 @@ from unmix_plugin.captures.decisions import decisions_of
 from unmix_plugin.captures.finding_poses import check_pose_options, marked_poses, poses_of_written_views
 from unmix_plugin.captures.layouts.masks import with_mask_files
 from unmix_plugin.captures.match_checks import views_of_other_poses
-from unmix_plugin.captures.options import GONE_LAYOUTS, LAYOUTS, ProcessOptions, find_views, parse_mosaic
-from unmix_plugin.captures.plan import Plan, hashes, input_files, make_plan
+from unmix_plugin.captures.options import ProcessOptions, check_options, find_views, parse_mosaic
+from unmix_plugin.captures.plan import Plan, make_plan
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.pose_set import PosedCamera
 from unmix_plugin.captures.posing import (
@@ -42,7 +42,13 @@ from unmix_plugin.captures.wavelengths import parse_wavelengths
 from unmix_plugin.captures.writing.resampling import Resampling
 from unmix_plugin.captures.writing.scene_files import match_views, seen_views, write_scene_files
 from unmix_plugin.captures.writing.view_files import ViewRecord, write_view
-from unmix_plugin.captures.writing.work_folder import WorkFolder, refuse_output
+from unmix_plugin.captures.writing.work_folder import (
+    WorkFolder,
+    fingerprint,
+    hashes,
+    input_files,
+    refuse_output,
+)
 from unmix_plugin.engine.decisions import decision_table
 from unmix_plugin.engine.runs.replacing import (
     require_apart,
@@ -68,7 +74,7 @@ def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list
         RunError: the folder can't be written.
     """
     # Load: what the options name, and which files are views.
-    _check(options)
+    check_options(options)
     refuse_output(options.output_dir, options.overwrite)
     folder = WorkFolder(options.output_dir)
     folder.refuse_foreign()
@@ -101,7 +107,7 @@ def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list
     # Write: view after view, into a folder that an interrupted start may have left.
     resampled = {} if posed is None else _resampled_lenses(plan, posed)
     if folder.begin(
-        {**plan.fingerprint(options), "lenses": sorted(numbers for _, numbers in resampled.values())}
+        {**fingerprint(plan, options), "lenses": sorted(numbers for _, numbers in resampled.values())}
     ):
         say(f"going on with {folder.path}")
     lenses = {name: lens for name, (lens, _) in resampled.items()}
@@ -165,7 +171,7 @@ def _write_views(
                 folder.note(record)
         if record is not None:
             records[view.name] = record
-    return records, _unreadable_remarks(unreadable.found)
+    return records, unreadable.remarks
 
 
 def _without(views: Iterable[CaptureView], left_out: Collection[str]) -> list[CaptureView]:
@@ -183,20 +189,16 @@ def _wanted_views(capture: Capture, options: ProcessOptions) -> tuple[list[Captu
                 raise ConfigError(
                     f"{flag} {name}: no view of this name; there are {name_some(names, 5)}{hint}"
                 )
-    left_out = _unreadable_remarks(capture.unreadable)
+    left_out = dict(capture.unreadable)
     unreadable = UnreadableViews(len(names))
     wanted = _without(capture.views, options.leave_out)
     for view in wanted:
         with unreadable.noted(view.name):
             for row in sorted({0, view.cube.shape[0] // 2, view.cube.shape[0] - 1}):
                 view.cube.read(slice(row, row + 1))
-    left_out |= _unreadable_remarks(unreadable.found)
+    left_out |= unreadable.remarks
     left_out |= {name: Remark.of(Code.VIEW_NOT_WANTED, [name]) for name in options.leave_out}
     return _without(wanted, left_out), left_out
-
-
-def _unreadable_remarks(found: Iterable[tuple[str, str]]) -> dict[str, Remark]:
-    return {name: Remark.of(Code.VIEW_UNREADABLE, [name], why=why) for name, why in found}
 
 
 def _blurred(
@@ -236,30 +238,9 @@ def _refuse_late(lenses: Collection[str]) -> None:
     """Refuse lenses that pictures would have to be brought into, as they are written already."""
     if lenses:
         raise CaptureError(
-            f"the lens of {name_some(list(lenses))} is not found in the pictures, and its own is not one that scenes "
+            f"the lens of {name_some([*lenses])} is not found in the pictures, and its own is not one that scenes "
             "have; give poses with --poses FILE, or leave these views out"
         )
-
-
-def _check(options: ProcessOptions) -> None:
-    if options.layout in GONE_LAYOUTS:
-        raise ConfigError(f"the layout '{options.layout}' is no longer read: {GONE_LAYOUTS[options.layout]}")
-    if options.layout not in LAYOUTS:
-        raise ConfigError(
-            f"'{options.layout}' is not a layout; expected one of {', '.join(LAYOUTS)}"
-            + did_you_mean(options.layout, LAYOUTS, form="; {}")
-        )
-    if options.white is not None and options.white_rectangle is not None:
-        raise ConfigError("--white and --white-rectangle both name a white reference; give one of them")
-    if options.white_reflectance != "1" and options.white is None and options.white_rectangle is None:
-        raise ConfigError("--white-reflectance needs a white reference: --white or --white-rectangle")
-    for name, number in (("--bin-pixels", options.bin_pixels), ("--bin-bands", options.bin_bands)):
-        if number < 1:
-            raise ConfigError(f"{name} {number}: expected 1 or more")
-    if options.saturation is not None and not 0 < options.saturation < float("inf"):
-        raise ConfigError(f"--saturation {options.saturation:g}: expected a stored number above 0")
-    if not options.max_noise > 0:
-        raise ConfigError(f"--max-noise {options.max_noise:g}: expected a share above 0")
 
 
 def _open_capture(options: ProcessOptions, references: GivenReferences) -> Capture:

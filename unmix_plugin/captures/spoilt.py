@@ -52,12 +52,8 @@ class UnreadableViews:
 
     def __init__(self, num_views: int) -> None:
         self._most = int(_MOST_SPOILT * num_views) if num_views >= _LEAST_WITH_UNREADABLE else 0
-        self._reasons: dict[str, str] = {}
-
-    @property
-    def found(self) -> tuple[tuple[str, str], ...]:
-        """Names and reasons."""
-        return tuple(self._reasons.items())
+        self.remarks: dict[str, Remark] = {}
+        """Why views can't be read, by their names."""
 
     @contextmanager
     def noted(self, name: str) -> Iterator[None]:
@@ -65,9 +61,9 @@ class UnreadableViews:
         try:
             yield
         except CaptureError as error:
-            if len(self._reasons) >= self._most:
+            if len(self.remarks) >= self._most:
                 raise
-            self._reasons[name] = str(error)
+            self.remarks[name] = Remark.of(Code.VIEW_UNREADABLE, [name], why=str(error))
 
 
 @dataclass(frozen=True)
@@ -209,19 +205,16 @@ def sharpness_of(brightness: Float32[np.ndarray, "H W"], seen: Bool[np.ndarray, 
     """
     found = []
     for picture, known in ((brightness, seen), (brightness.T, seen.T)):
-        fine, coarse = (_second_difference(picture, known, lag) for lag in (_FINE_PX, _COARSE_PX))
-        if fine is None or coarse is None or coarse <= 0:
+        contrasts = []
+        for lag in (_FINE_PX, _COARSE_PX):
+            first, middle, last = (slice(0, -2 * lag), slice(lag, -lag), slice(2 * lag, None))
+            used = known[:, first] & known[:, middle] & known[:, last]
+            if used.sum() < _LEAST_DIFFERENCES:
+                return []
+            differences = (picture[:, first] - 2 * picture[:, middle] + picture[:, last])[used]
+            contrasts.append(float(np.sqrt(np.mean(np.square(differences, dtype=np.float64)))))
+        fine, coarse = contrasts
+        if coarse <= 0:
             return []
         found.append(fine / coarse)
     return found
-
-
-def _second_difference(
-    picture: Float32[np.ndarray, "H W"], seen: Bool[np.ndarray, "H W"], lag: int
-) -> float | None:
-    left, middle, right = (slice(0, -2 * lag), slice(lag, -lag), slice(2 * lag, None))
-    known = seen[:, left] & seen[:, middle] & seen[:, right]
-    if known.sum() < _LEAST_DIFFERENCES:
-        return None
-    differences = picture[:, left] - 2 * picture[:, middle] + picture[:, right]
-    return float(np.sqrt(np.mean(np.square(differences[known], dtype=np.float64))))

@@ -31,6 +31,7 @@ from unmix_plugin.captures.names import natural_order, view_names
 from unmix_plugin.captures.readers.derived import join_lines
 from unmix_plugin.captures.readers.envi import described_image
 from unmix_plugin.captures.readers.opening import open_spectral_file
+from unmix_plugin.captures.report import Remark
 from unmix_plugin.captures.spoilt import UnreadableViews
 from unmix_plugin.errors import CaptureError, name_some
 from unmix_plugin.formats.envi import header_beside
@@ -110,7 +111,7 @@ def _open_views(
     files: Sequence[Path],
     options: ReadOptions,
     joined: Mapping[Path, Sequence[Path]] | None = None,
-) -> tuple[tuple[CaptureView, ...], tuple[tuple[str, str], ...]]:
+) -> tuple[tuple[CaptureView, ...], dict[str, Remark]]:
     """Views in the order of their names, each with references of its own by their kind, and the picture among the files
     that lies beside it; and those that can't be opened, with the reason. Raises CaptureError: those are too many.
 
@@ -128,7 +129,7 @@ def _open_views(
             cube = cubes[0] if len(cubes) == 1 else join_lines(cubes)
             view = CaptureView(name, cube, picture=pictures.get(path.with_name(_stem(path))))
             views.append(replace(view, **opened))
-    return tuple(sorted(views, key=lambda view: natural_order(view.name))), unreadable.found
+    return tuple(sorted(views, key=lambda view: natural_order(view.name))), unreadable.remarks
 
 
 def _capture_of_groups(root: Path, folders: dict[Path, list[Path]], options: ReadOptions) -> Capture:

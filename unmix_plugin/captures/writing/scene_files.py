@@ -22,12 +22,13 @@ from unmix_plugin.captures.checks import SeenView, angles_between, check_views
 from unmix_plugin.captures.cube import CaptureView
 from unmix_plugin.captures.match_checks import MatchedScene, check_matches
 from unmix_plugin.captures.options import ProcessOptions, plain_options
-from unmix_plugin.captures.plan import Plan, SensorPlan, hashes
+from unmix_plugin.captures.plan import Plan, SensorPlan
 from unmix_plugin.captures.poses.pose_set import PoseSet
 from unmix_plugin.captures.posing import PosedViews
 from unmix_plugin.captures.report import Kind, Remark, report_text, sentences
 from unmix_plugin.captures.value_checks import ViewSample, check_files, check_values
 from unmix_plugin.captures.writing.view_files import FULL_SCALE, BackgroundRule, ViewRecord
+from unmix_plugin.captures.writing.work_folder import RECORD_NAME, hashes
 from unmix_plugin.engine.decisions import Decision
 from unmix_plugin.engine.printing import plot_text, terminal_text
 from unmix_plugin.engine.runs.atomic_files import write_file
@@ -41,7 +42,6 @@ from unmix_plugin.scenes.folder import lens_keys, matrix_entry, transforms_bytes
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 
-RECORD_NAME = "process.json"
 _SCENE_NAME, _SHEET_NAME, _REPORT_NAME = "transforms.json", "contact-sheet.png", "report.txt"
 _ILLUMINANT_NAME, _FLAT_LIGHT_NAME, _POINTS_NAME = "illuminant.csv", "flat-light.csv", "points.ply"
 _MOST_BANDS = 8

@@ -1,16 +1,22 @@
-"""The unfinished folder beside the output, in which a scene gathers until it is complete."""
+"""The unfinished folder beside the output, in which a scene gathers until it is complete; and the files that the scene
+is made of, by which an interrupted start tells whether it can be gone on with."""
 
 from __future__ import annotations
 
 import json
 import os
 import re
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from unmix_plugin import __version__
+from unmix_plugin.captures.cube import CaptureView
+from unmix_plugin.captures.options import ProcessOptions, plain_options
+from unmix_plugin.captures.plan import Plan
 from unmix_plugin.captures.poses.estimation import WORK_FILES
-from unmix_plugin.captures.writing.scene_files import RECORD_NAME
+from unmix_plugin.captures.poses.pose_set import reading
 from unmix_plugin.captures.writing.view_files import ViewRecord
 from unmix_plugin.engine.runs.atomic_files import make_folder, write_errors_as, write_file
 from unmix_plugin.engine.runs.replacing import (
@@ -24,7 +30,10 @@ from unmix_plugin.engine.runs.replacing import (
 )
 from unmix_plugin.engine.runs.run_folder import RunLock
 from unmix_plugin.errors import ConfigError
+from unmix_plugin.scenes.reading.faults import sha256_of
 
+RECORD_NAME = "process.json"
+"""How a scene was made: in each that this command wrote."""
 _PLAN, _VIEWS, _POSES, _LOCK = "plan.json", "views", "poses", "process.lock"
 _SCRATCH = re.compile(rf"{_LOCK}|(.*/)?{TEMPORARY.pattern}|{_POSES}/({WORK_FILES.pattern})")
 """What the unfinished folder has beside listed files: the lock, what killed writers left, and COLMAP's files."""
@@ -146,3 +155,55 @@ def refuse_output(output: Path, overwrite: bool) -> None:
 
 def _json(value: Any) -> bytes:
     return (json.dumps(value, indent=1, sort_keys=True) + "\n").encode()
+
+
+def fingerprint(plan: Plan, options: ProcessOptions) -> dict[str, Any]:
+    """What must be the same for views to be gone on with: options, decisions and input files. Raises CaptureError: a
+    file can't be read."""
+    free = [
+        "output_dir",
+        "overwrite",
+        "poses",
+        "marker_size",
+        "marker_family",
+        "known_distance",
+        "angles",
+    ]
+    fixed = {key: value for key, value in plain_options(options).items() if key not in free}
+    files = [path for view in plan.views for path in input_files(view)] + list(plan.option_files)
+    stamps = []  # path, size and time of change, which tell quickly whether a file is still the same
+    for file in _files_of(files):
+        with reading(file):
+            facts = file.stat()
+        stamps.append([os.fspath(file.absolute()), facts.st_size, facts.st_mtime_ns])
+    # What transforms.json states may change while its poses, which views don't depend on, are mended.
+    stated = [view.cube.linear for view in plan.views if view.cube.linear is not None]
+    return {
+        "version": __version__,
+        "options": fixed,
+        "decisions": plan.decisions,
+        "bands": {name: sensor.centers_nm.tolist() for name, sensor in plan.sensors.items()},
+        "gains": sorted({repr((one.gains.tolist(), one.offsets.tolist())) for one in stated}),
+        "files": stamps,
+    }
+
+
+def input_files(view: CaptureView) -> list[Path]:
+    """Every file that a view is made of."""
+    more = [path for path in (view.picture, view.mask, view.labels) if path is not None]
+    return [*view.cube.files, *more, *(path for file in view.references for path in file.files)]
+
+
+def hashes(paths: Iterable[Path]) -> list[dict[str, Any]]:
+    """Path, size and SHA-256 of each file. CaptureError where one can't be read."""
+    found = []
+    for file in _files_of(paths):
+        with reading(file):
+            found.append({"path": os.fspath(file), "bytes": file.stat().st_size, "sha256": sha256_of(file)})
+    return found
+
+
+def _files_of(paths: Iterable[Path]) -> Iterator[Path]:
+    """Files, and those of a folder that a reader takes as one."""
+    for path in paths:
+        yield from sorted(child for child in path.iterdir() if child.is_file()) if path.is_dir() else [path]
