@@ -13,4 +13,4 @@ def nothing_is_forced_to_disk(no_wait_for_the_disk):
 @pytest.fixture
 def no_contact_sheet(monkeypatch: pytest.MonkeyPatch):
     """For scenes of plain views; drawing it would take three quarters of their time."""
-    monkeypatch.setattr(scene_files, "_contact_sheet", lambda *_: b"")
+    monkeypatch.setattr(scene_files, "contact_sheet", lambda *_: b"")

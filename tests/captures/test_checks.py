@@ -13,12 +13,12 @@ from scipy.ndimage import gaussian_filter
 
 from tests.captures.file_factory import present
 from tests.scenes.scene_factory import look_at
-from unmix_plugin.captures.checks import SeenView, _overlap, check_views
+from unmix_plugin.captures.checks import SeenView, check_views
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet
 from unmix_plugin.captures.report import Code, Kind, report_text, sentences
-from unmix_plugin.captures.writing.scene_files import _OUTLINE, _contact_sheet
-from unmix_plugin.captures.writing.view_files import ViewRecord, _detail
+from unmix_plugin.captures.writing.scene_files import OUTLINE, contact_sheet
+from unmix_plugin.captures.writing.view_files import ViewRecord, detail_of
 from unmix_plugin.spectral.colour.srgb import encode_srgb
 
 LAMP = np.array([2.0, 1.0, 5.0])
@@ -118,16 +118,17 @@ def test_overlap_of_cameras_in_parallel_takes_sparse_points(tmp_path: Path):
     down = view_at(tmp_path, "a", np.array([0.0, 0.01, 4.0]), LAMP)
     poses = [down.camera.camera_to_world + np.eye(3, 4, 3) * x for x in (0.0, 0.5, 1.0, 9.0)]
     views = [replace(down, camera=replace(down.camera, camera_to_world=pose)) for pose in poses]
-    assert [remark.code for remark in _overlap(views, None)] == [Code.OVERLAP_UNJUDGED]
-    overlap, alone = _overlap(views, ball_points())
-    assert (overlap.code, overlap.values["least"]) == (Code.OVERLAP, "0%")
-    assert "1 view with hardly any overlap with another one (at most 0%, from 0 degrees" in alone.sentence
+    assert Code.OVERLAP_UNJUDGED in {remark.code for remark in check_views(views, None)}
+    found = {remark.code: remark for remark in check_views(views, ball_points())}
+    assert found[Code.OVERLAP].values["least"] == "0%"
+    alone = found[Code.VIEWS_ALONE].sentence
+    assert "1 view with hardly any overlap with another one (at most 0%, from 0 degrees" in alone
 
 
 def test_detail_falls_when_a_picture_is_blurred():
     sharp = np.random.default_rng(0).random((80, 80)).astype(np.float32)
     seen = np.ones((80, 80), bool)
-    details = [_detail(gaussian_filter(sharp, sigma), seen) for sigma in (0.3, 0.7, 1.2)]
+    details = [detail_of(gaussian_filter(sharp, sigma), seen) for sigma in (0.3, 0.7, 1.2)]
     assert details[0] > 1.2 * details[1] > 1.4 * details[2]
 
 
@@ -179,8 +180,8 @@ def ball_points(count: int = 1500) -> np.ndarray:
 @pytest.mark.filterwarnings("ignore:No artists")
 def test_every_view_stands_on_the_sheet_with_its_outline(tmp_path: Path):
     views = _views(tmp_path, ring_of(7), None)
-    sheet = _contact_sheet(views, {}, PoseSet({}, "", points=ball_points(200)), "seven views")
+    sheet = contact_sheet(views, {}, PoseSet({}, "", points=ball_points(200)), "seven views")
     pixels = np.asarray(Image.open(io.BytesIO(sheet)).convert("RGB")).astype(int)
-    outline = np.abs(pixels - np.array(_OUTLINE)).max(axis=-1) < 40
+    outline = np.abs(pixels - np.array(OUTLINE)).max(axis=-1) < 40
     columns, rows = (np.flatnonzero(outline.any(axis=axis)) for axis in (0, 1))
     assert ((np.diff(columns) > 10).sum() + 1, (np.diff(rows) > 10).sum() + 1) == (4, 2)  # of the grid

@@ -18,11 +18,11 @@ from unmix_plugin.captures.writing.view_files import (
     UNLABELLED,
     ViewRecipe,
     alpha_picture,
+    read_labels,
     read_view_masks,
     write_view,
 )
-from unmix_plugin.captures.writing.view_files import _clean as clean
-from unmix_plugin.captures.writing.view_files import _read_labels as read_labels
+from unmix_plugin.captures.writing.view_files import clean_mask as clean
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.spectral.colour.srgb import decode_srgb
 

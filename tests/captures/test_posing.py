@@ -17,10 +17,10 @@ from unmix_plugin.captures.cube import CameraTags, CaptureView, Cube
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet
 from unmix_plugin.captures.poses.reading import read_poses
-from unmix_plugin.captures.posing import _complete_rigs, _place_poses, pose_views
+from unmix_plugin.captures.posing import complete_rigs, place_poses, pose_views
 from unmix_plugin.captures.process import _refuse_late
 from unmix_plugin.captures.report import Code, Kind, sentences
-from unmix_plugin.captures.writing.scene_files import _write_points
+from unmix_plugin.captures.writing.scene_files import write_points
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.scenes.reading.loader import load_scene
 
@@ -29,7 +29,7 @@ FAR = np.array([500_123.0, 5_400_321.0, 300.0])
 
 @pytest.mark.parametrize("is_flight", [False, True])
 def test_a_ring_stands_upright_around_the_origin_whatever_its_world_was_and_what_took_it(is_flight):
-    placed, _placement, notes = _place_poses(elsewhere(ring_set(12)), is_flight=is_flight)
+    placed, _placement, notes = place_poses(elsewhere(ring_set(12)), is_flight=is_flight)
     assert Code.UP_BY_AXES in {note.code for note in notes}
     stacked = np.stack([camera.camera_to_world for camera in placed.cameras.values()])
     np.testing.assert_allclose(np.linalg.norm(stacked[:, :, 3], axis=1), 1, atol=1e-9)
@@ -41,10 +41,10 @@ def test_a_ring_stands_upright_around_the_origin_whatever_its_world_was_and_what
 
 def test_a_known_up_axis_is_kept_and_cameras_in_parallel_have_their_points_in_the_middle():
     points = np.array([[1.0, 2.0, -3.0], [2.0, 2.0, -3.0], [3.0, 2.0, -3.0]])
-    _, placement, notes = _place_poses(ring_set(up=np.array([0.0, 0.0, 1.0])))
+    _, placement, notes = place_poses(ring_set(up=np.array([0.0, 0.0, 1.0])))
     np.testing.assert_array_equal(placement.rotation, np.eye(3))
     assert Code.UP_OF_SOURCE in {note.code for note in notes}
-    _, placement, notes = _place_poses(replace(in_a_row(), points=points))
+    _, placement, notes = place_poses(replace(in_a_row(), points=points))
     np.testing.assert_allclose(placement.to_source(np.zeros(3)), [2, 2, -3])
     assert Code.UP_BY_MEAN in {note.code for note in notes}
 
@@ -53,7 +53,7 @@ def test_land_lies_level_below_the_cameras_of_a_flight():
     """Which sway above land at z = 0, in a world that knows no up."""
     points = np.random.default_rng(0).uniform(-1, 1, (50, 3)) * np.array([1, 1, 0.01])
     cameras = {f"{n}": PosedCamera(pose[:3], None) for n, pose in enumerate(flight_poses(6))}
-    placed, placement, notes = _place_poses(PoseSet(cameras, "a flight", points), is_flight=True)
+    placed, placement, notes = place_poses(PoseSet(cameras, "a flight", points), is_flight=True)
     land = present(placed.points)
     assert np.ptp(land[:, 2]) < 0.1 * np.ptp(land[:, 0])
     assert all(camera.camera_to_world[2, 3] > 0.5 for camera in placed.cameras.values())
@@ -63,8 +63,8 @@ def test_land_lies_level_below_the_cameras_of_a_flight():
 
 def test_sparse_points_are_written_with_their_colours(tmp_path):
     points, colours = np.arange(6.0).reshape(2, 3), np.array([[1, 2, 3], [4, 5, 255]], np.uint8)
-    assert _write_points(tmp_path, ring_set()) == {}
-    written = _write_points(tmp_path, ring_set(points=points, colours=colours))
+    assert write_points(tmp_path, ring_set()) == {}
+    written = write_points(tmp_path, ring_set(points=points, colours=colours))
     assert written == {"ply_file_path": "points.ply"}
     vertex = PlyData.read(tmp_path / "points.ply")["vertex"]
     np.testing.assert_array_equal(np.stack([vertex[name] for name in "xyz"], 1), points)
@@ -73,7 +73,7 @@ def test_sparse_points_are_written_with_their_colours(tmp_path):
 
 def test_what_was_placed_returns_to_the_source_also_when_it_was_written(tmp_path):
     poses = elsewhere(ring_set(points=np.ones((2, 3)), offset=FAR))
-    placed, placement, _notes = _place_poses(poses)
+    placed, placement, _notes = place_poses(poses)
     stacked = {name: camera.camera_to_world for name, camera in placed.cameras.items()}
     found = read_poses(write_json(tmp_path / "transforms.json", transforms(stacked, **placement.to_json())))
     for name, camera in poses.cameras.items():
@@ -141,7 +141,7 @@ def turned_camera(seed: int) -> PosedCamera:
 def test_rotations_in_the_files_turn_a_lens_against_another():
     views = [rig_view("r1", sensor, ANGLES[sensor]) for sensor in "abc"]
     posed = {"r1b": turned_camera(3)}
-    completed, notes = _complete_rigs(views, posed)
+    completed, notes = complete_rigs(views, posed)
     numbers = {sensor: np.array(angles.split(","), float) for sensor, angles in ANGLES.items()}
     to_reference = {x: Rotation.from_euler("XYZ", n, degrees=True).as_matrix() for x, n in numbers.items()}
     base = posed["r1b"].camera_to_world
@@ -163,7 +163,7 @@ def test_offsets_and_lenses_that_were_found_go_before_those_in_the_files():
     posed = {f"{release}a": turned_camera(index) for index, release in enumerate(releases, start=1)}
     moved = {name[:2]: np.vstack([one.camera_to_world, [0, 0, 0, 1]]) @ offset for name, one in posed.items()}
     posed |= {f"{release}b": PosedCamera(moved[release][:3], lens) for release in releases[:2]}
-    completed, (note,) = _complete_rigs(views, posed)
+    completed, (note,) = complete_rigs(views, posed)
     np.testing.assert_allclose(completed["r3b"].camera_to_world, moved["r3"][:3], atol=1e-12)
     assert completed["r3b"].lens == lens
     assert (note.code, note.values["lens"]) == (Code.RIG_AS_OTHER_RELEASES, "b")
@@ -171,13 +171,13 @@ def test_offsets_and_lenses_that_were_found_go_before_those_in_the_files():
 
 def test_views_without_any_help_are_left_out_and_said_and_those_of_no_release_left_alone():
     views = [rig_view("r1", "a"), rig_view("r1", "b"), *(rig_view("r2", x, ANGLES[x]) for x in "ab")]
-    completed, notes = _complete_rigs(views, {"r1a": turned_camera(1)})
+    completed, notes = complete_rigs(views, {"r1a": turned_camera(1)})
     assert set(completed) == {"r1a"}
     codes = [(note.code, note.values["lens"]) for note in notes]
     assert (Code.RIG_OFFSET_UNKNOWN, "b") in codes
     assert [code for code, _ in codes].count(Code.RIG_WITHOUT_POSE) == 2
     single = [replace(views[0], name=name, sensor="", shot="") for name in ("one", "two")]
-    completed, notes = _complete_rigs(single, {"one": turned_camera(1)})
+    completed, notes = complete_rigs(single, {"one": turned_camera(1)})
     assert (set(completed), notes) == ({"one"}, [])
 
 

@@ -24,7 +24,7 @@ from tests.captures.poses.pose_factory import (
 )
 from unmix_plugin.captures.names import match_poses
 from unmix_plugin.captures.poses.reading import read_poses
-from unmix_plugin.captures.posing import _place_poses
+from unmix_plugin.captures.posing import place_poses
 from unmix_plugin.formats.meshes import read_ply_points
 
 _SIMILARITY = (
@@ -66,7 +66,7 @@ def colmap_files(is_binary: bool) -> dict[str, bytes]:
 def read_and_place(path: Path) -> None:
     """Read poses and do with them what a scene needs."""
     poses = read_poses(path)
-    placed, _, _ = _place_poses(poses)
+    placed, _, _ = place_poses(poses)
     match_poses(poses, [(name, []) for name in poses.cameras])
     for camera in placed.cameras.values():
         assert np.isfinite(camera.camera_to_world).all()

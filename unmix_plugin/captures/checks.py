@@ -216,12 +216,19 @@ def _overlap(views: Sequence[SeenView], points: _Points | None) -> list[Remark]:
     shares = np.zeros(len(views))
     nearest = np.zeros(len(views))
     for index, view in enumerate(views):
-        points = _points_seen(view, focus)
+        lens = view.camera.lens
+        assert lens is not None
+        steps = (np.arange(8) + 0.5) / 8
+        x, y = np.meshgrid(steps * lens.width, steps * lens.height)
+        rays = view.camera.rays_of(np.column_stack([x.ravel(), y.ravel()]))
+        rays = view.axis[None] if rays is None else rays
+        depth = max(float((focus - view.position) @ view.axis), 1e-9)
+        places = view.position + depth * rays / (rays @ view.axis)[:, None]
         angles = np.where(np.arange(len(views)) == index, np.inf, between[index])
         nearest[index] = angles.min()
         near = np.argsort(angles)[: min(6, len(views) - 1)]
         near = near[angles[near] <= _FAR_NEIGHBOUR_DEG]
-        seen = [np.isfinite(views[other]._pixels_of(points)).all(axis=1).mean() for other in near]
+        seen = [np.isfinite(views[other]._pixels_of(places)).all(axis=1).mean() for other in near]
         shares[index] = max(seen, default=0.0)
     alone = [index for index in range(len(views)) if shares[index] < _LEAST_OVERLAP]
     overlap = {"usual": f"{np.median(shares):.0%}", "least": f"{shares.min():.0%}"}
@@ -232,17 +239,6 @@ def _overlap(views: Sequence[SeenView], points: _Points | None) -> list[Remark]:
         Remark.of(Code.OVERLAP, **overlap, **angles_away),
         *_of_views(Code.VIEWS_ALONE, names, share=best, angle=angle),
     ]
-
-
-def _points_seen(view: SeenView, focus: Float64[np.ndarray, "3"]) -> _Points:
-    """Points on a grid of the view's rays, at the depth of the middle."""
-    assert view.camera.lens is not None
-    steps = (np.arange(8) + 0.5) / 8
-    x, y = np.meshgrid(steps * view.camera.lens.width, steps * view.camera.lens.height)
-    rays = view.camera.rays_of(np.column_stack([x.ravel(), y.ravel()]))
-    rays = view.axis[None] if rays is None else rays
-    depth = max(float((focus - view.position) @ view.axis), 1e-9)
-    return view.position + depth * rays / (rays @ view.axis)[:, None]
 
 
 def _blur(views: Sequence[SeenView], _: _Points | None) -> list[Remark]:
@@ -290,30 +286,23 @@ def _exposure(views: Sequence[SeenView], points: _Points | None) -> list[Remark]
 
 
 def _moving_light(views: Sequence[SeenView], points: _Points | None) -> list[Remark]:
-    """Whether the light moves with the camera, as on a turntable."""
-    found = _slope_of_light(views, points)
-    if found is None:
-        return [Remark.of(Code.LIGHT_UNMEASURED)]
-    slope, error, pairs = found
-    facts = {"slope": f"{slope:.2f}", "error": f"{error:.2f}", "pairs": pairs}
-    moves = abs(slope) > max(_LEAST_SLOPE, _CERTAINTY * error)
-    return [Remark(code, facts) for code in (Code.LIGHT, *[Code.LIGHT_MOVES] * moves)]
-
-
-def _slope_of_light(views: Sequence[SeenView], points: _Points | None) -> tuple[float, float, int] | None:
-    """The slope over all pairs of near views, its standard error, the number of pairs; None with too few of them."""
+    """Whether the light moves with the camera, as on a turntable: by the median slope of all pairs of near views and
+    its standard error."""
     if points is None or len(points) < _LEAST_PAIR_POINTS:
-        return None
+        return [Remark.of(Code.LIGHT_UNMEASURED)]
     angles, (low, high) = angles_between(views), _PAIR_ANGLES_DEG
     pairs = np.argwhere((angles >= low) & (angles <= high))
     pairs = pairs[:: max(1, len(pairs) // _MOST_PAIRS)]
-    slopes = [_slope(views[first], views[second], points) for first, second in pairs.tolist()]
-    values = np.array([slope for slope in slopes if slope is not None])
-    if len(values) < _LEAST_PAIRS:
-        return None
-    middle = float(np.median(values))
-    deviation = 1.4826 * float(np.median(np.abs(values - middle)))
-    return middle, 1.2533 * deviation / float(np.sqrt(len(values))), len(values)
+    found = [_slope(views[first], views[second], points) for first, second in pairs.tolist()]
+    slopes = np.array([slope for slope in found if slope is not None])
+    if len(slopes) < _LEAST_PAIRS:
+        return [Remark.of(Code.LIGHT_UNMEASURED)]
+    slope = float(np.median(slopes))
+    deviation = 1.4826 * float(np.median(np.abs(slopes - slope)))
+    error = 1.2533 * deviation / float(np.sqrt(len(slopes)))
+    facts = {"slope": f"{slope:.2f}", "error": f"{error:.2f}", "pairs": len(slopes)}
+    moves = abs(slope) > max(_LEAST_SLOPE, _CERTAINTY * error)
+    return [Remark(code, facts) for code in (Code.LIGHT, *[Code.LIGHT_MOVES] * moves)]
 
 
 def _slope(first: SeenView, second: SeenView, points: _Points) -> float | None:

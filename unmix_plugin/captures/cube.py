@@ -279,8 +279,12 @@ class Cube:
             return np.zeros((wanted[0], width, len(indices)), self.dtype.newbyteorder("="))
         is_slice = len(rising) == len(indices) == rising[-1] - rising[0] + 1
         try:
-            chosen = slice(rising[0], rising[-1] + 1) if is_slice else rising
-            values = self._read(slice(first, last), chosen)
+            if self.numbers is not None:
+                chosen = slice(rising[0], rising[-1] + 1) if is_slice else rising
+                values = self.numbers.read(slice(self.first_line + first, self.first_line + last), chosen)
+            else:
+                lines = slice(first, last)
+                values = np.concatenate([self.parts[band].read(lines) for band in rising], axis=-1)
         except CaptureError:
             raise
         except Exception as error:
@@ -289,12 +293,6 @@ class Cube:
             raise CaptureError(f"{self.path}: reading gave an array of {values.shape}; expected {wanted}")
         values = values if np.array_equal(rising, indices) else values[..., order]
         return np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("="))
-
-    def _read(self, rows: slice, bands: BandIndex) -> Shaped[np.ndarray, "h W b"]:
-        if self.numbers is not None:
-            return self.numbers.read(slice(self.first_line + rows.start, self.first_line + rows.stop), bands)
-        parts = [self.parts[band] for band in np.arange(len(self.parts))[bands]]
-        return np.concatenate([part.read(rows) for part in parts], axis=-1)
 
     def remarking(self, *remarks: Remark) -> Cube:
         """The cube with more remarks."""

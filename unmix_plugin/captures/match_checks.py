@@ -61,10 +61,6 @@ _POSES_OFF_PX = 4.0
 """Distance left with any lens, from which poses are said to be wrong."""
 _FITS_PX, _MOST_FITTING = 1.5, 0.35
 """Distance at which a point fits, and their share with which poses can't be wrong, whatever the others do."""
-_LEAST_LIKE = 0.8
-"""Difference of a match over that between a feature and the one most like it in its own picture."""
-_SAME_PLACE_PX = 3.0
-"""Features of one place, which are alike."""
 _TIMES_USUAL_MISS, _LEAST_TRACKS, _MOST_OTHER_POSES = 4.0, 10, 0.25
 """Distance of a view's points over the usual one, points by which a view is judged, and share of views, with which some
 are said to have other poses."""
@@ -148,12 +144,20 @@ class MatchedScene:
     @staticmethod
     def of(names: Sequence[str], views: Sequence[MatchedView]) -> MatchedScene:
         """Match the features of near views of one sensor."""
-        axes = np.stack([-camera.camera_to_world[:, 2] for camera, _ in views])
-        angles_deg = np.degrees(np.arccos(np.clip(axes @ axes.T, -1.0, 1.0)))
-        chosen = _choose_stars(angles_deg)
-        used = sorted({index for star in chosen for index in star})
-        features = {index: _features_of(views[index][1]) for index in used}
         cameras = [camera for camera, _ in views]
+        axes = np.stack([-camera.camera_to_world[:, 2] for camera in cameras])
+        angles_deg = np.degrees(np.arccos(np.clip(axes @ axes.T, -1.0, 1.0)))
+        chosen = []  # views spread over all, each with those that are turned least against it, but enough
+        for view in evenly_spaced(len(views), _STARS):
+            low, high = _ANGLES_DEG
+            order = np.argsort(angles_deg[view]).tolist()
+            near = [other for other in order if other != view and low <= angles_deg[view, other] <= high]
+            if len(near) >= _LEAST_VIEWS - 1:
+                chosen.append([view, *near[:_AROUND]])
+        features = {
+            index: _features_of(views[index][1])
+            for index in sorted({view for star in chosen for view in star})
+        }
         pairs: _Pairs = {}
         found = [_find_star(star, cameras, features, pairs) for star in chosen]
         stars = tuple(star for star in found if star is not None)
@@ -239,18 +243,11 @@ def _misplaced(scene: MatchedScene) -> dict[str, Remark]:
 
 def check_matches(scene: MatchedScene, findings: list[str]) -> str:
     """What was measured in the views of one sensor; what does not fit is appended to findings."""
-    if scene.lens is None or sum(len(star.ideal) for star in scene.stars) < _LEAST_POINTS:
-        return "poses and lens are not compared with matched points: too few views share features"
-    return _judge(scene.stars, scene.lens, findings)
-
-
-def _shrunk(lens: Lens | None) -> float:
-    """Scale of the picture in which features are found."""
-    return 1.0 if lens is None else min(1.0, _LONGEST_SIDE_PX / max(lens.width, lens.height))
-
-
-def _judge(stars: Sequence[_Star], lens: Lens, findings: list[str]) -> str:
     from scipy.optimize import least_squares
+
+    stars, lens, count = scene.stars, scene.lens, sum(len(star.ideal) for star in scene.stars)
+    if lens is None or count < _LEAST_POINTS:
+        return "poses and lens are not compared with matched points: too few views share features"
 
     def misses(values: np.ndarray) -> np.ndarray:
         found = np.concatenate([star.misses_px(values).reshape(-1, 2) for star in stars])
@@ -259,12 +256,7 @@ def _judge(stars: Sequence[_Star], lens: Lens, findings: list[str]) -> str:
     def most(values: np.ndarray) -> float:
         return float(np.percentile(np.linalg.norm(misses(values), axis=1), _PERCENTILE))
 
-    def fitting(values: np.ndarray) -> float:
-        return float(np.mean(np.linalg.norm(misses(values), axis=1) < _FITS_PX))
-
-    shrunk = _shrunk(lens)
     given = np.zeros(3)
-    start = most(given)
     best = least_squares(
         lambda values: misses(values).ravel(),
         given,
@@ -272,47 +264,39 @@ def _judge(stars: Sequence[_Star], lens: Lens, findings: list[str]) -> str:
         x_scale=(0.1, 0.05, 0.05),
         bounds=(-_BOUNDS, _BOUNDS),
     ).x
-    left, corner = most(best), lens.ideal_of(np.array([[0.5, 0.5]]))
-    moved = 0.0
+    before, after, shrunk = most(given), most(best), _shrunk(lens)
+    fitting = float(np.mean(np.linalg.norm(misses(best), axis=1) < _FITS_PX))
+    corner, moved = lens.ideal_of(np.array([[0.5, 0.5]])), 0.0
     if corner is not None:
         moved = float(np.linalg.norm(lens.pixels_of(_changed(corner, best)) - lens.pixels_of(corner)))
-    count = sum(len(star.ideal) for star in stars)
-    said = (
-        f"{count} points matched in three views or more are seen {start / shrunk:.2f} px from where poses and lens put "
-        f"them ({_PERCENTILE} % of them less)"
+    measured = (
+        f"{count} points matched in three views or more are seen {before / shrunk:.2f} px from where poses and lens "
+        f"put them ({_PERCENTILE} % of them less)"
     )
-    is_better = left < min(_BETTER * start, _POSES_OFF_PX) and np.all(np.abs(best) < 0.99 * _BOUNDS)
-    if start > _LEAST_OFF_PX and is_better and moved * shrunk > _LEAST_MOVED_PX and count > _LEAST_FOR_LENS:
+    is_better = after < min(_BETTER * before, _POSES_OFF_PX) and np.all(np.abs(best) < 0.99 * _BOUNDS)
+    if before > _LEAST_OFF_PX and is_better and moved * shrunk > _LEAST_MOVED_PX and count > _LEAST_FOR_LENS:
         findings.append(
-            f"the pictures do not fit their lens: {said}, but {left / shrunk:.2f} px with a focal length of "
+            f"the pictures do not fit their lens: {measured}, but {after / shrunk:.2f} px with a focal length of "
             f"{np.exp(best[0]):.0%} and radial terms that move the corners by {moved:.0f} px: is the lens of another "
             "model (a fisheye), or given for pictures of another size or crop?"
         )
-    elif left > _POSES_OFF_PX and fitting(best) < _MOST_FITTING:
+    elif after > _POSES_OFF_PX and fitting < _MOST_FITTING:
         findings.append(
-            f"the pictures do not fit their poses: {said}, and no lens brings them below {left / shrunk:.2f} px: are "
-            "the poses those of these pictures, and in the convention that their file is read with?"
+            f"the pictures do not fit their poses: {measured}, and no lens brings them below {after / shrunk:.2f} px: "
+            "are the poses those of these pictures, and in the convention that their file is read with?"
         )
-    return said
+    return measured
+
+
+def _shrunk(lens: Lens | None) -> float:
+    """Scale of the picture in which features are found."""
+    return 1.0 if lens is None else min(1.0, _LONGEST_SIDE_PX / max(lens.width, lens.height))
 
 
 def _changed(ideal: Points, lens: Float64[np.ndarray, "3"]) -> Points:
     """Ideal coordinates that another lens gives to the same pixels: logarithm of a focal length, two radial terms."""
     squared = (ideal**2).sum(axis=1, keepdims=True)
     return ideal * (np.exp(-lens[0]) * (1.0 + lens[1] * squared + lens[2] * squared**2))
-
-
-def _choose_stars(angles_deg: Float64[np.ndarray, "N N"]) -> list[list[int]]:
-    """Views spread over all, each with those that are turned least against it, but enough."""
-    low, high = _ANGLES_DEG
-    stars = []
-    count = len(angles_deg)
-    for view in evenly_spaced(count, _STARS):
-        order = np.argsort(angles_deg[view]).tolist()
-        near = [other for other in order if other != view and low <= angles_deg[view, other] <= high]
-        if len(near) >= _LEAST_VIEWS - 1:
-            stars.append([view, *near[:_AROUND]])
-    return stars
 
 
 def _features_of(picture: Path) -> tuple[Points, np.ndarray] | None:
@@ -386,16 +370,6 @@ def _nearest_in_own_view(features: tuple[Points, np.ndarray]) -> Float64[np.ndar
     return np.sqrt(np.where(same, np.inf, np.maximum(differences, 0)).min(axis=1))
 
 
-def _is_unlike_others(features: _Features, shrunk: float) -> Float64[np.ndarray, " F"]:
-    """How unlike each feature is what is most like it elsewhere in its own picture."""
-    from scipy.spatial.distance import cdist
-
-    places, descriptors = features
-    unlike = cdist(descriptors, descriptors)
-    unlike[cdist(places, places) * shrunk < _SAME_PLACE_PX] = np.inf
-    return unlike.min(axis=1)
-
-
 def _matches(
     one: _Features, other: _Features, shrunk: float
 ) -> tuple[Int[np.ndarray, " M"], Int[np.ndarray, " M"]]:
@@ -414,9 +388,6 @@ def _matches(
         apart = np.linalg.norm(one[1][found[:, 0]].astype(float) - other[1][found[:, 1]], axis=1)
         repeated = np.minimum(alone[0][found[:, 0]], alone[1][found[:, 1]])
         found = found[apart < _MOST_REPEATED * repeated]
-        unlike = [_is_unlike_others(each, shrunk)[found[:, side]] for side, each in enumerate((one, other))]
-        apart = np.linalg.norm(one[1][found[:, 0]].astype(float) - other[1][found[:, 1]], axis=1)
-        found = found[apart < _LEAST_LIKE * np.minimum(*unlike)]
         if len(found) < _LEAST_MATCHES:
             return none, none
         _, explained = ransac(

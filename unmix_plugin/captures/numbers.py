@@ -114,19 +114,19 @@ class Numbers:
 
     def read(self, rows: slice, bands: BandIndex) -> Shaped[np.ndarray, "h W b"]:
         """A copy of some rows, and of bands in rising order; slices have both ends and no step."""
-        part = self._part_of_blocks(rows, bands) if len(self.blocks) > 1 else self._part(rows, bands)
+        block = self.blocks[0]
+        if len(self.blocks) > 1:
+            part = self._part_of_blocks(rows, bands)
+        elif isinstance(block, Decoded) and block.shape == self.shape:
+            pieces = block.pieces(self.axes.index("y"), rows.start, rows.stop)
+            parts = [
+                _take(piece, self.axes, slice(max(0, rows.start - first), rows.stop - first), bands)
+                for first, piece in pieces
+            ]
+            part = parts[0] if len(parts) == 1 else np.concatenate(parts)
+        else:
+            part = _take(block.array().reshape(self.shape), self.axes, rows, bands)
         return part.astype(self.dtype.newbyteorder("="), copy=False)
-
-    def _part(self, rows: slice, bands: BandIndex) -> np.ndarray:
-        (block,) = self.blocks
-        if not isinstance(block, Decoded) or block.shape != self.shape:
-            return _take(block.array().reshape(self.shape), self.axes, rows, bands)
-        pieces = block.pieces(self.axes.index("y"), rows.start, rows.stop)
-        parts = [
-            _take(piece, self.axes, slice(max(0, rows.start - first), rows.stop - first), bands)
-            for first, piece in pieces
-        ]
-        return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     def _part_of_blocks(self, rows: slice, bands: BandIndex) -> np.ndarray:
         """Of the blocks that are asked for; within one, all bands are read, of which there are few."""

@@ -105,7 +105,7 @@ def pose_views(
     a camera, or a lens does not fit its view. Raises ConfigError: the distance does not go with the poses."""
     files = [(view.name, [*view.cube.files, *filter(None, [view.picture])]) for view in views]
     cameras, matched = match_poses(poses, files)
-    cameras, completed = _complete_rigs(views, cameras)
+    cameras, completed = complete_rigs(views, cameras)
     posed = tuple(view for view in views if view.name in cameras)
     if len(posed) < _LEAST_VIEWS:
         raise CaptureError(
@@ -123,7 +123,7 @@ def pose_views(
         for name, lens in of_files.items()
         if lens.note
     ]
-    placed, to_scene, how = _place_poses(replace(poses, cameras=fitted), is_flight=has_many_lenses)
+    placed, to_scene, how = place_poses(replace(poses, cameras=fitted), is_flight=has_many_lenses)
     metres, keys = poses.metres_per_unit, to_scene.to_json() if poses.has_world else {}
     if known is not None:
         if metres is not None:
@@ -183,7 +183,7 @@ def lens_of_view(lens: Lens | None, view: CaptureView) -> Lens:
     return lens.seen_as(width, height, (0.0, 0.0), (across, down))
 
 
-def _complete_rigs(
+def complete_rigs(
     views: Sequence[CaptureView], cameras: Mapping[str, PosedCamera]
 ) -> tuple[dict[str, PosedCamera], list[Remark]]:
     """Cameras by view, also of views that get the pose of another lens of their shot, moved by the rig; and what
@@ -252,7 +252,7 @@ def _square(pose: Float64[np.ndarray, "3 4"]) -> _Pose:
     return np.vstack([pose, [0.0, 0.0, 0.0, 1.0]])
 
 
-def _place_poses(poses: PoseSet, is_flight: bool = False) -> tuple[PoseSet, Placement, list[Remark]]:
+def place_poses(poses: PoseSet, is_flight: bool = False) -> tuple[PoseSet, Placement, list[Remark]]:
     """Poses in the scene's world, the way there from the source's, and how up axis, middle and scale were found. In a
     flight, cameras that all look one way look down."""
     stacked = np.stack([camera.camera_to_world for camera in poses.cameras.values()])
@@ -265,7 +265,12 @@ def _place_poses(poses: PoseSet, is_flight: bool = False) -> tuple[PoseSet, Plac
         middle, how_middle = nearest, Code.MIDDLE_OF_AXES
     reach = float(np.linalg.norm(stacked[:, :, 3] - middle, axis=1).max())
     scale = 1.0 / reach if reach > 0 else 1.0
-    rotation = _turn_to_z(up)
+
+    # The smallest rotation that takes up to +z.
+    cosine, cross = float(up[2]), np.cross(np.eye(3), np.cross(up, (0.0, 0.0, 1.0)))
+    is_upside_down = cosine < -1.0 + 1e-9
+    rotation = FLIP if is_upside_down else np.eye(3) + cross + cross @ cross / (1.0 + cosine)
+
     inner = Placement(rotation, -rotation @ middle, scale)
     placed = replace(poses.moved(inner), offset=np.zeros(3), up=np.array([0.0, 0.0, 1.0]))
     how = [Remark.of(how_up), Remark.of(how_middle)]
@@ -290,15 +295,6 @@ def _find_up(
     if np.linalg.norm(mean) > 0.1:
         return mean / np.linalg.norm(mean), Code.UP_BY_MEAN
     return np.array([0.0, 0.0, 1.0]), Code.UP_UNKNOWN
-
-
-def _turn_to_z(up: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
-    """The smallest rotation that takes a unit vector to +z."""
-    axis, cosine = np.cross(up, (0.0, 0.0, 1.0)), float(up[2])
-    if cosine < -1.0 + 1e-9:
-        return np.diag([1.0, -1.0, -1.0])
-    cross = np.cross(np.eye(3), axis)
-    return np.eye(3) + cross + cross @ cross / (1.0 + cosine)
 
 
 # How long a unit of the poses' world is, by two points.

@@ -244,7 +244,8 @@ def refuse_outside(what: str, rectangle: tuple[int, int, int, int], size: tuple[
 
 
 def _column_means(file: Cube) -> tuple[Float32[np.ndarray, "1 W B"], float]:
-    """Mean over lines, and how much more than noise the rows differ, judged on a few bands."""
+    """Mean over lines, and how much more than noise the rows differ, judged on a few bands: the variance of the means
+    of square blocks, as a multiple of what pixels that differ by noise alone would give."""
     height, width, bands = file.shape
     total, count = np.zeros((width, bands)), np.zeros((width, bands))
     missing = np.zeros((height, width), bool)
@@ -258,24 +259,20 @@ def _column_means(file: Cube) -> tuple[Float32[np.ndarray, "1 W B"], float]:
         total += np.nansum(values, axis=0, dtype=np.float64)
         count += np.isfinite(values).sum(axis=0)
     mean = total / np.where(count > 0, count, np.nan)
-    judged = np.unique(np.linspace(0, bands - 1, 5).astype(int))
-    every, patterns = slice(0, height), []
-    for band in judged:
+
+    every, side, patterns = slice(0, height), _PATTERN_BLOCK_PX, []
+    down, across = height // side, width // side
+    for band in np.unique(np.linspace(0, bands - 1, 5).astype(int)):
         index = np.array([band])
         values = stated_values(file, file.read(every, index), every, index)[..., 0]
-        patterns.append(_pattern(np.nan_to_num(np.where(missing, 0.0, values - mean[:, band]))))
+        residual = np.nan_to_num(np.where(missing, 0.0, values - mean[:, band]))
+        variance = residual.var()
+        if down == 0 or across == 0 or not variance > 0:
+            patterns.append(0.0)
+            continue
+        blocks = residual[: down * side, : across * side].reshape(down, side, across, side).mean(axis=(1, 3))
+        patterns.append(float(blocks.var() * side * side / variance))
     return mean[None].astype(np.float32), float(np.median(patterns))
-
-
-def _pattern(residual: Float64[np.ndarray, "H W"]) -> float:
-    """Variance of the means of square blocks, as a multiple of what pixels that differ by noise alone would give."""
-    side = _PATTERN_BLOCK_PX
-    height, width = (length // side * side for length in residual.shape)
-    variance = residual.var()
-    if height == 0 or width == 0 or not variance > 0:
-        return 0.0
-    blocks = residual[:height, :width].reshape(height // side, side, width // side, side).mean(axis=(1, 3))
-    return float(blocks.var() * side * side / variance)
 
 
 def _stretched(mean: Float32[np.ndarray, "1 V B"], width: int) -> Float32[np.ndarray, "1 W B"]:

@@ -25,7 +25,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from unmix_plugin.captures.cube import Capture, CaptureView, Cube, ReadOptions
+from unmix_plugin.captures.cube import Capture, CaptureView, ReadOptions
 from unmix_plugin.captures.layouts.masks import MASK_FOLDERS, is_mask_of
 from unmix_plugin.captures.names import natural_order, view_names
 from unmix_plugin.captures.readers.derived import join_lines
@@ -125,8 +125,10 @@ def _open_views(
         plain = replace(options, wavelengths_nm=None)
         with unreadable.noted(name):
             opened = {kind: open_spectral_file(reference, plain) for kind, reference in own.items()}
-            cubes = [_open(part, options) for part in (joined or {}).get(path, [path])]
+            cubes = [open_spectral_file(part, options) for part in (joined or {}).get(path, [path])]
             cube = cubes[0] if len(cubes) == 1 else join_lines(cubes)
+            if path.suffix.lower() in _PICTURE_SUFFIXES and cube.dtype.itemsize == 1:
+                cube = replace(cube, is_srgb=True)
             view = CaptureView(name, cube, picture=pictures.get(path.with_name(_stem(path))))
             views.append(replace(view, **opened))
     return tuple(sorted(views, key=lambda view: natural_order(view.name))), unreadable.remarks
@@ -139,12 +141,19 @@ def _capture_of_groups(root: Path, folders: dict[Path, list[Path]], options: Rea
     joined: dict[Path, list[Path]] = {}
     shown_too: list[Path] = []
     for folder, there in folders.items():
-        beside = _shown_too(there)
+        # Files whose names are those of pictures of another cube of the folder.
+        stems = {_stem(path).casefold() for path in there}
+        named = [
+            (path, match["of"].casefold()) for path in there if (match := _SHOWN_TOO.fullmatch(_stem(path)))
+        ]
+        beside = [path for path, of in named if of in stems or {f"{of}_cube", f"{of}-cube"} & stems]
         shown_too += beside
         joined |= (parts := _parts_of_scans([path for path in there if path not in beside]))
         further = {path for own in parts.values() for path in own[1:]}
         cubes = [path for path in there if path not in beside and path not in further]
-        left_out += _sort_into(groups, _place(folder, root), cubes, is_tree=folder != root)
+        is_step = folder != root and folder.name.lower() in _STEPS
+        place = folder.parent if is_step else folder  # that stands for a view: NAME of NAME/capture
+        left_out += _sort_into(groups, place, cubes, is_tree=folder != root)
     complete = {key: group for key, group in groups.items() if "cube" in group or "result" in group}
     if not complete:
         raise CaptureError(
@@ -211,13 +220,6 @@ def _parts_of_scans(cubes: Sequence[Path]) -> dict[Path, list[Path]]:
     return found
 
 
-def _shown_too(cubes: Sequence[Path]) -> list[Path]:
-    """Files whose names are those of pictures of another cube of the folder."""
-    stems = {_stem(path).casefold() for path in cubes}
-    owners = {path: match["of"].casefold() for path in cubes if (match := _SHOWN_TOO.fullmatch(_stem(path)))}
-    return [path for path, of in owners.items() if of in stems or {f"{of}_cube", f"{of}-cube"} & stems]
-
-
 def _sort_into(
     groups: dict[tuple[Path, str], dict[str, Path]], place: Path, cubes: list[Path], is_tree: bool
 ) -> list[Path]:
@@ -263,11 +265,6 @@ def _is_reference(path: Path, stems: Sequence[str]) -> bool:
     return of.casefold() in (stem.casefold() for stem in stems)
 
 
-def _place(folder: Path, root: Path) -> Path:
-    """The folder that stands for a view: NAME of NAME/capture."""
-    return folder.parent if folder != root and folder.name.lower() in _STEPS else folder
-
-
 def _cubes_among(files: Sequence[Path]) -> list[Path]:
     """Files that may be cubes; a header that describes one of them is none."""
     cubes = [path for path in files if path.suffix.lower() in _CUBE_SUFFIXES]
@@ -304,12 +301,6 @@ def _names(paths: Sequence[Path]) -> list[str]:
 
 def _same_name(first: Path, second: Path) -> str:
     return f"{first} and {second} would both be the view '{_name(first)}'; rename or move one of them"
-
-
-def _open(path: Path, options: ReadOptions) -> Cube:
-    file = open_spectral_file(path, options)
-    is_picture = path.suffix.lower() in _PICTURE_SUFFIXES and file.dtype.itemsize == 1
-    return replace(file, is_srgb=True) if is_picture else file
 
 
 def _visible_files(folder: Path) -> list[Path]:

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path, PurePosixPath
@@ -87,7 +88,11 @@ def _read_json(path: Path, given: Mapping[str, _Size]) -> PoseSet:
     content = load_json(path)
     if is_polycam(content):
         return read_polycam(find_polycam(path.parent) or [path])
-    return read_transforms({path: content}, given) if _has_frames(content) else read_opensfm(path, content)
+    frames = content if isinstance(content, list) else []  # a bare list of those of transforms.json
+    has_frames = any(isinstance(frame, dict) and "transform_matrix" in frame for frame in frames)
+    if has_frames or (isinstance(content, dict) and "frames" in content):
+        return read_transforms({path: content}, given)
+    return read_opensfm(path, content)
 
 
 def _read_xml(path: Path) -> PoseSet:
@@ -198,14 +203,6 @@ _BENT_MODELS: dict[str, models.Bend] = {
 }
 
 
-def _has_frames(content: Any) -> bool:
-    """Whether JSON looks like a transforms.json: an object with frames, or a bare list of them."""
-    if isinstance(content, dict):
-        return "frames" in content
-    frames = content if isinstance(content, list) else []
-    return any(isinstance(frame, dict) and "transform_matrix" in frame for frame in frames)
-
-
 def read_transforms(contents: Mapping[Path, Any], sizes: Mapping[str, _Size]) -> PoseSet:
     """Poses of what one transforms.json holds, or one for each split. Raises CaptureError: they are none, or can't be
     represented."""
@@ -275,7 +272,7 @@ def _read_frames(
             if given.width is not None and given.height is not None:
                 size = (given.width, given.height)
             else:
-                size = _size_in(picture) or _size_of_view(given, names[0], sizes, where)
+                size = _size_of(picture, names[0], given, sizes, where)
                 if size is not None and picture is None and given.focal_px != (None, None):
                     warnings.append(
                         "'w' and 'h' are absent, and so are pictures that it names: focal lengths are taken in pixels "
@@ -294,26 +291,21 @@ def _read_frames(
     return read
 
 
-def _size_in(picture: Path | None) -> _Size | None:
-    """Size of a picture by its file; None where it is not there or no picture."""
+def _size_of(
+    picture: Path | None, name: str, lens: Intrinsics, sizes: Mapping[str, _Size], where: str
+) -> _Size | None:
+    """Size of the picture of a frame; where it is not there, that of the view of its name among those given. Raises
+    CaptureError: the lens is that of a larger picture than this view."""
     from PIL import Image
 
-    if picture is None:
-        return None
-    try:
-        with open_regular(picture) as file, Image.open(file, formats=FORMATS) as opened:
+    if picture is not None:
+        unreadable = suppress(OSError, ValueError, Image.DecompressionBombError)
+        with unreadable, open_regular(picture) as file, Image.open(file, formats=FORMATS) as opened:
             return opened.size
-    except (OSError, ValueError, Image.DecompressionBombError):
-        return None
-
-
-def _size_of_view(lens: Intrinsics, name: str, given: Mapping[str, _Size], where: str) -> _Size | None:
-    """Size of the view of a frame among those given, where nothing tells that of its picture. Raises CaptureError: the
-    lens is that of a larger picture."""
     path = PurePosixPath(name.replace("\\", "/"))
-    size = next((given[key] for key in (name, path.name, path.stem) if key in given), None)
-    if size is None and len(set(given.values())) == 1:
-        size = next(iter(given.values()))
+    size = next((sizes[key] for key in (name, path.name, path.stem) if key in sizes), None)
+    if size is None and len(set(sizes.values())) == 1:
+        size = next(iter(sizes.values()))
     x, y = lens.center_px
     if size is not None and ((x or 0.0) >= size[0] or (y or 0.0) >= size[1]):
         found = ", ".join(

@@ -98,11 +98,11 @@ def write_scene_files(
     Raises:
         RunError: the folder can't be written.
     """
-    keys = posed.keys | _write_points(folder, posed.poses) | _write_light(folder, plan)
+    keys = posed.keys | write_points(folder, posed.poses) | _write_light(folder, plan)
     seen = seen_views(folder, plan, posed, records)
     # Views of sensors with other bands can't be compared with those of the one that took the most.
-    greatest = _greatest_sensor(seen)
-    alike = {name for name, sensor in plan.sensors.items() if _has_bands_of(sensor, plan.sensors[greatest])}
+    bands_nm = plan.sensors[_greatest_sensor(seen)].centers_nm
+    alike = {name for name, sensor in plan.sensors.items() if np.array_equal(sensor.centers_nm, bands_nm)}
     findings = sentences(left_out, Kind.WRONG)
     findings += dict.fromkeys((*sentences(plan.remarks, Kind.WRONG), *posed.poses.warnings))
     checked = check_views([v for v in seen if v.record.sensor in alike], posed.poses.points)
@@ -113,14 +113,14 @@ def write_scene_files(
         checked += check_values(samples, angles_between(same), sensor.centers_nm)
     findings += sentences(checked, Kind.WRONG)
     measured = [*sentences(checked, Kind.MEASURED), check_matches(matched, findings)]
+
     title = f"{plan.capture.root}: {len(seen)} views, {_sizes_in_words(plan)}"
     done = sentences(left_out, Kind.DONE) + _what_was_done(plan, posed, [view.record for view in seen])
+    report = report_text(title, findings, measured, done, decided)
+    write_file(folder / _REPORT_NAME, terminal_text(report).encode())
     reasons = {remark.where[0]: remark for remark in left_out}
     spoilt = [record for name, record in records.items() if name in reasons]
-    write_file(
-        folder / _REPORT_NAME, terminal_text(report_text(title, findings, measured, done, decided)).encode()
-    )
-    write_file(folder / _SHEET_NAME, _contact_sheet(seen, plan.sensors, posed.poses, title, spoilt))
+    write_file(folder / _SHEET_NAME, contact_sheet(seen, plan.sensors, posed.poses, title, spoilt))
     views = [asdict(view.record) for view in seen]
     totals = ("num_pixels", "saturated_pixels", "missing_pixels", "clipped_values", "negative_values")
     record = {
@@ -138,25 +138,23 @@ def write_scene_files(
         "references": hashes(plan.option_files),
         "views": views,
     }
-    _write_json(folder / RECORD_NAME, record)
-    _write_json(
-        folder / _SCENE_NAME,
-        _transforms_json(plan, posed.views, seen, keys | _left_out_views(reasons, records)),
-    )
+    write_file(folder / RECORD_NAME, transforms_bytes(record))
+
+    named = {name: remark.code.name.lower().replace("_", " ") for name, remark in reasons.items()}
+    others = [
+        {
+            "name": name,
+            "reason": reason.removeprefix("view "),
+            **(records[name].paths if name in records else {}),
+        }
+        for name, reason in named.items()
+    ]
+    keys |= {"left_out": others} if others else {}
+    write_file(folder / _SCENE_NAME, transforms_bytes(_transforms_json(plan, posed.views, seen, keys)))
     return findings
 
 
-def _left_out_views(reasons: Mapping[str, Remark], records: Mapping[str, ViewRecord]) -> dict[str, Any]:
-    """The key of the scene that names views that are not among its frames, and why."""
-    views = [
-        {"name": name, "reason": remark.code.name.lower().replace("_", " ").removeprefix("view "), **paths}
-        for name, remark in reasons.items()
-        for paths in [records[name].paths if name in records else {}]
-    ]
-    return {"left_out": views} if views else {}
-
-
-def _write_points(folder: Path, poses: PoseSet) -> dict[str, str]:
+def write_points(folder: Path, poses: PoseSet) -> dict[str, str]:
     """Write the sparse points, in the scene's world, beside a scene's transforms.json; its key, if there are any."""
     if poses.points is None or len(poses.points) == 0:
         return {}
@@ -179,22 +177,13 @@ def _write_light(folder: Path, plan: Plan) -> dict[str, Any]:
     meanings = [sensor.meaning for sensor in sensors]
     if not all(one.is_reflectance and (one.states_one or plan.scale.value == 1.0) for one in meanings):
         return {}
-    if first.lamp is not None and all(_has_bands_of(first, other) for other in others):
+    if first.lamp is not None and all(np.array_equal(first.centers_nm, one.centers_nm) for one in others):
         lamp = SpectraTable(Bands(first.centers_nm), ("power",), first.lamp[None])
         write_spectra_csv(folder / _ILLUMINANT_NAME, lamp)
     bands = Bands(np.unique(np.concatenate([sensor.centers_nm for sensor in sensors])))
     write_spectra_csv(folder / _FLAT_LIGHT_NAME, SpectraTable(bands, ("power",), np.ones((1, len(bands)))))
     divided = {} if plan.scale.value == 1.0 else {"reflectance_of_1": plan.scale.value}
     return {"illuminant_path": _FLAT_LIGHT_NAME, **divided}
-
-
-def _has_bands_of(sensor: SensorPlan, other: SensorPlan) -> bool:
-    """Whether views of two sensors can be compared."""
-    return np.array_equal(sensor.centers_nm, other.centers_nm)
-
-
-def _write_json(path: Path, content: dict[str, Any]) -> None:
-    write_file(path, transforms_bytes(content))
 
 
 def _transforms_json(
@@ -282,7 +271,14 @@ def _what_was_done(plan: Plan, posed: PosedViews, views: Sequence[ViewRecord]) -
             lines += [f"{where}{what}: {used[key]['use']}"] if key in used else []
         stored, evidence = sensor.saturation.stored, sensor.saturation.evidence
         lines.append(f"{where}saturation: {evidence if stored is None else f'from {stored:g} ({evidence})'}")
-        lines += [f"{where}bands left out: {bands} ({reason})" for reason, bands in _left_out(sensor).items()]
+        dropped: dict[str, list[str]] = defaultdict(list)
+        for index, band in sorted(sensor.bands.dropped.items()):
+            reason = "noisy" if band.fault is BandFault.NOISY else band.reason
+            dropped[reason].append(f"{sensor.bands.wavelengths_nm[index]:g} nm")
+        lines += [
+            f"{where}bands left out: {name_some(names, _MOST_BANDS)} ({reason})"
+            for reason, names in dropped.items()
+        ]
     lines.append(
         f"{plan.scale.value:g} is written as 1: {plan.scale.evidence}; full scale of the cubes is {FULL_SCALE}"
     )
@@ -318,22 +314,13 @@ def _what_was_done(plan: Plan, posed: PosedViews, views: Sequence[ViewRecord]) -
     return [*lines, *(text for one in (posed, plan) for text in sentences(one.remarks, Kind.DONE))]
 
 
-def _left_out(sensor: SensorPlan) -> dict[str, str]:
-    """Wavelengths of the bands that were left out, by reason; the first few of many."""
-    found: dict[str, list[str]] = defaultdict(list)
-    for index, band in sorted(sensor.bands.dropped.items()):
-        reason = "noisy" if band.fault is BandFault.NOISY else band.reason
-        found[reason].append(f"{sensor.bands.wavelengths_nm[index]:g} nm")
-    return {reason: name_some(names, _MOST_BANDS) for reason, names in found.items()}
-
-
 # The contact sheet.
 
 _MOST_VIEWS = 96
 """Views that are shown; of more, as many evenly spaced."""
 _SHEET_PX, _TILE_PX = 1300, (96, 300)
 """Width of all pictures beside each other; least and greatest longer side of one."""
-_OUTLINE, _IGNORED, _BEHIND = (255, 0, 200), (255, 60, 60), 60
+OUTLINE, _IGNORED, _BEHIND = (255, 0, 200), (255, 60, 60), 60
 """Colours of the mask's outline and of pixels without a measurement; grey of the background."""
 _RIM_PX = 4
 """Width of the frame around a view that is left out."""
@@ -343,7 +330,7 @@ _LETTERS_AN_INCH = 10
 _MOST_POINTS = 6000
 
 
-def _contact_sheet(
+def contact_sheet(
     views: Sequence[SeenView],
     sensors: Mapping[str, SensorPlan],
     poses: PoseSet,
@@ -413,7 +400,7 @@ def _small_picture(picture_file: Path, record: ViewRecord, side_px: int) -> UInt
     opacity = picture[..., 3:] / 255.0
     pixels = np.rint(picture[..., :3] * opacity + _BEHIND * (1 - opacity)).astype(np.uint8)
     matter = picture[..., 3] > 127
-    pixels[matter & np.logical_not(ndimage.binary_erosion(matter, border_value=1))] = _OUTLINE
+    pixels[matter & np.logical_not(ndimage.binary_erosion(matter, border_value=1))] = OUTLINE
     mask = record.paths.get("mask_path")
     if mask is not None:
         with Image.open(picture_file.parent.parent / mask) as opened:

@@ -133,7 +133,7 @@ def write_view(
     """Write cube, picture and mask of a view, its pixels brought into another lens where there is a resampling. Raises
     CaptureError: a file of the view can't be read. Raises RunError: the folder can't be written."""
     raster = recipe.calibration.raster
-    masks, labels = read_view_masks(view, raster, recipe.use_opacity), _read_labels(view, raster)
+    masks, labels = read_view_masks(view, raster, recipe.use_opacity), read_labels(view, raster)
     if resampling is not None:
         # A pixel is valid where all are that it is made of.
         valid = resampling.smooth(np.where(masks.valid, np.uint8(OPAQUE), np.uint8(0))) == OPAQUE
@@ -153,7 +153,7 @@ def write_view(
             values_a_pixel = max(len(recipe.calibration.bands), _WEIGHTS_A_PIXEL if resampling else 0)
             for first, last in raster.blocks(values_a_pixel, _BLOCK_VALUES):
                 part = read(first, last) if resampling is None else resampling.rows(first, last, read)
-                file.write(_stored(tally.add(first, part, recipe), part).data)
+                file.write(tally.add(first, part, recipe).data)
         tally.finish_masks(recipe)
         if (tally.opacity < OPAQUE).any():
             with write_errors_as(path):
@@ -191,8 +191,8 @@ class _Tally:
         """That a backdrop is known by; of the backdrop, once masks are finished."""
         self.specks, self.holes = 0, 0
 
-    def add(self, first: int, part: CalibratedRows, recipe: ViewRecipe) -> Float32[np.ndarray, "h W B"]:
-        """Take note of some rows; gives their values on the scene's scale."""
+    def add(self, first: int, part: CalibratedRows, recipe: ViewRecipe) -> UInt16[np.ndarray, "h W B"]:
+        """Take note of some rows; gives the numbers that are stored of them."""
         rows = slice(first, first + len(part.values))
         values = part.values * np.float32(1.0 / recipe.scale)
         self.missing[rows] |= part.missing
@@ -213,7 +213,13 @@ class _Tally:
         counted = (self.opacity[rows] > HALF) & ~self.missing[rows]
         self.sum += counted.ravel().astype(np.float32) @ values.reshape(-1, values.shape[-1])
         self.num_summed += int(counted.sum())
-        return values
+
+        np.multiply(values, FULL_SCALE, out=values)
+        np.clip(np.rint(values, out=values), 0, FULL_SCALE, out=values)
+        stored = values.astype("<u2")
+        stored[part.saturated] = FULL_SCALE
+        stored[part.missing] = 0
+        return stored
 
     def finish_masks(self, recipe: ViewRecipe) -> None:
         """Opacity without specks and holes; full for pixels without a measurement, as nothing is known there."""
@@ -221,11 +227,11 @@ class _Tally:
             assert self.features is not None
             seen = recipe.background.find(self.features, ~self.missing)
             if seen is not None:
-                matter, self.specks, self.holes = _clean(~seen.shown)
+                matter, self.specks, self.holes = clean_mask(~seen.shown)
                 self.opacity = np.rint(seen.opacity(matter) * OPAQUE).astype(np.uint8)
                 self.features = seen.behind
         elif recipe.background is not None:
-            matter, self.specks, self.holes = _clean(self.opacity > 0)
+            matter, self.specks, self.holes = clean_mask(self.opacity > 0)
             self.opacity = np.where(matter, OPAQUE, 0).astype(np.uint8)
         self.opacity[self.missing] = OPAQUE
 
@@ -246,21 +252,12 @@ class _Tally:
             specks=self.specks,
             holes=self.holes,
             brightness=float(np.median(self.brightness[seen])) if seen.any() else 0.0,
-            detail=_detail(self.brightness, seen),
+            detail=detail_of(self.brightness, seen),
             mean_spectrum=(self.sum / max(1, self.num_summed)).tolist(),
             background_brightness=usual,
             background_spread=(bright - dark) / usual if usual > 0 else 0.0,
             sharpness=sharpness_of(self.brightness, seen),
         )
-
-
-def _stored(values: Float32[np.ndarray, "h W B"], part: CalibratedRows) -> UInt16[np.ndarray, "h W B"]:
-    np.multiply(values, FULL_SCALE, out=values)
-    np.clip(np.rint(values, out=values), 0, FULL_SCALE, out=values)
-    stored = values.astype("<u2")
-    stored[part.saturated] = FULL_SCALE
-    stored[part.missing] = 0
-    return stored
 
 
 def _cut_out(path: Path, start: int, tally: _Tally, recipe: ViewRecipe) -> None:
@@ -295,11 +292,11 @@ def _cut_out(path: Path, start: int, tally: _Tally, recipe: ViewRecipe) -> None:
                 file.write(values.data)
 
 
-def _detail(brightness: Float32[np.ndarray, "H W"], seen: Bool[np.ndarray, "H W"]) -> float:
+def detail_of(brightness: Float32[np.ndarray, "H W"], seen: Bool[np.ndarray, "H W"]) -> float:
     """Contrast of the finest structures against those twice as large; falls when a picture is blurred.
 
     Both are root mean squares of differences between a pixel and the mean of its neighbours, at full and at half
-    resolution, over pixels of matter; 0 where there is too little of it.
+    resolution, over pixels that are seen; 0 where there are too few of these.
     """
     height, width = (length // 2 * 2 for length in brightness.shape)
     halved = brightness[:height, :width].reshape(height // 2, 2, width // 2, 2).mean(axis=(1, 3))
@@ -362,7 +359,7 @@ def read_view_masks(view: CaptureView, raster: Raster, use_opacity: bool) -> Vie
     return ViewMasks(valid, opacity, straight)
 
 
-def _read_labels(view: CaptureView, raster: Raster) -> UInt8[np.ndarray, "H W"] | None:
+def read_labels(view: CaptureView, raster: Raster) -> UInt8[np.ndarray, "H W"] | None:
     """True materials of a view, none where several share a square that is averaged; None if it has no labels. Raises
     CaptureError: the file can't be read, has another size than the cube, or is a picture in colour."""
     if view.labels is None:
@@ -424,7 +421,7 @@ def _read(path: Path, pixels_of: Callable[[Image.Image], np.ndarray], view: Capt
         raise CaptureError(f"{path} of view {view.name} {error}") from error
 
 
-def _clean(matter: Bool[np.ndarray, "H W"]) -> tuple[Bool[np.ndarray, "H W"], int, int]:
+def clean_mask(matter: Bool[np.ndarray, "H W"]) -> tuple[Bool[np.ndarray, "H W"], int, int]:
     """Remove specks, then fill holes, each connected by edges and smaller than `_SMALL_SHARE` of the picture.
 
     Returns:
@@ -434,7 +431,7 @@ def _clean(matter: Bool[np.ndarray, "H W"]) -> tuple[Bool[np.ndarray, "H W"], in
     >>> mask[20:80, 20:80] = True
     >>> mask[40, 40] = False
     >>> mask[5, 5] = True
-    >>> cleaned, specks, holes = _clean(mask)
+    >>> cleaned, specks, holes = clean_mask(mask)
     >>> int(cleaned.sum()), specks, holes
     (3600, 1, 1)
     """
