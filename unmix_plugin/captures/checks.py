@@ -25,7 +25,7 @@ from unmix_plugin.captures.report import Code, Remark
 from unmix_plugin.captures.writing.view_files import ViewRecord
 from unmix_plugin.engine.geometry.camera_paths import meeting_point
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.sampling import evenly_spaced
+from unmix_plugin.engine.sampling import evenly_spaced, robust_deviation
 from unmix_plugin.scenes.doctor import check_lenses, check_masks, contradicted_share
 from unmix_plugin.spectral.colour.srgb import decode_srgb
 
@@ -275,7 +275,7 @@ def _exposure(views: Sequence[SeenView], points: _Points | None) -> list[Remark]
             gains[index] = np.median(ratios)
     if np.isnan(gains).any():
         return [Remark.of(Code.BRIGHTNESS_OF_FEW_POINTS)]
-    usual = 1.4826 * float(np.median(np.abs(gains - np.median(gains))))
+    usual = float(robust_deviation(gains))
     jumps = [
         f"{view.name} ({np.exp(gain):.2f} times as bright)"
         for view, gain in zip(views, gains, strict=True)
@@ -298,8 +298,7 @@ def _moving_light(views: Sequence[SeenView], points: _Points | None) -> list[Rem
     if len(slopes) < _LEAST_PAIRS:
         return [Remark.of(Code.LIGHT_UNMEASURED)]
     slope = float(np.median(slopes))
-    deviation = 1.4826 * float(np.median(np.abs(slopes - slope)))
-    error = 1.2533 * deviation / float(np.sqrt(len(slopes)))
+    error = 1.2533 * float(robust_deviation(slopes)) / float(np.sqrt(len(slopes)))
     facts = {"slope": f"{slope:.2f}", "error": f"{error:.2f}", "pairs": len(slopes)}
     moves = abs(slope) > max(_LEAST_SLOPE, _CERTAINTY * error)
     return [Remark(code, facts) for code in (Code.LIGHT, *[Code.LIGHT_MOVES] * moves)]

@@ -22,6 +22,7 @@ from unmix_plugin.captures.report import Code, Remark
 from unmix_plugin.captures.sample import BRIGHT_PERCENTILE, StoredCounts, WhiteSample
 from unmix_plugin.captures.spoilt import ViewPixels
 from unmix_plugin.captures.writing.view_files import BackgroundRule
+from unmix_plugin.engine.sampling import robust_deviation
 from unmix_plugin.errors import CaptureError, ConfigError
 
 _DETECTOR_ENDS = {2**bits - 1 for bits in (8, 10, 12, 14, 16)}
@@ -279,7 +280,7 @@ def background_rule(
     everywhere = np.concatenate([BackgroundRule.brightness(kind, sample), brightness])
     brightest = float(np.percentile(np.clip(everywhere, 0.0, 1.0), _BRIGHTEST_PERCENTILE))
     level = float(np.median(brightness))
-    deviation = 1.4826 * float(np.median(np.abs(brightness - level)))
+    deviation = float(robust_deviation(brightness))
     distance = max(_DEVIATIONS * deviation, _LEAST_DISTANCE * brightest)
     share = level / brightest if brightest > 0 else 0.0
     if (kind == "white" and share < _LEAST_WHITE) or (kind == "black" and share > _MOST_BLACK):

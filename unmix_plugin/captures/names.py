@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
 from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet
@@ -22,6 +22,19 @@ def path_text(text: str) -> str:
     'images/0001.png'
     """
     return text.strip().replace("\\", "/").removeprefix("./")
+
+
+def size_of_view(name: str, sizes: Mapping[str, tuple[int, int]]) -> tuple[int, int] | None:
+    """Width and height of the view that the name of an image means: its own, its file's or the stem's, otherwise those
+    that all views have; None where nothing tells.
+
+    Args:
+        name: As in `path_text`.
+        sizes: By any of these names.
+    """
+    path, only = PurePosixPath(name), set(sizes.values())
+    found = next((sizes[key] for key in (name, path.name, path.stem) if key in sizes), None)
+    return only.pop() if found is None and len(only) == 1 else found
 
 
 def natural_order(name: str) -> list[tuple[int, str]]:

@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float32, Float64
 
 from unmix_plugin.captures.poses.pose_set import PosedCamera
 from unmix_plugin.captures.report import Code, Remark
+from unmix_plugin.engine.sampling import robust_deviation
 from unmix_plugin.errors import CaptureError
 
 LEAST_JUDGED = 5
@@ -149,7 +150,7 @@ def _judge_exposure(
         is_over = saturated[index] > np.median(saturated[others]) + _MORE_SATURATED
         kept = steps[:, _DARKER_HALF] if is_over else steps
         factors = np.median(kept, axis=(1, 2))
-        spreads = 1.4826 * np.median(np.abs(kept - factors[:, None, None]), axis=(1, 2))
+        spreads = robust_deviation(kept, axis=(1, 2))
         middle = float(np.median(factors))
         agree = (np.sign(factors) == np.sign(middle)) & (np.abs(factors) > _LEAST_STEP)
         is_one_factor = is_over or np.median(spreads / np.maximum(np.abs(factors), 1e-9)) < _UNLIKE

@@ -28,6 +28,7 @@ from unmix_plugin.captures.cube import CaptureView
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.report import Code, Remark
 from unmix_plugin.captures.writing.view_files import FULL_SCALE, ViewRecord
+from unmix_plugin.engine.sampling import robust_deviation
 from unmix_plugin.scenes.reading.cubes import map_array
 
 _MOST_UNREAD, _HEADER_BYTES = 2.5, 20_000
@@ -152,7 +153,7 @@ def _exposure_steps(samples: Sequence[ViewSample], angles_deg: Float64[np.ndarra
         for other in others[:_NEIGHBOURS]:
             ratios = levels[other] - levels[view]
             step = float(np.median(ratios))
-            spread = 1.4826 * float(np.median(np.abs(ratios - step)))
+            spread = float(robust_deviation(ratios))
             if step > _STEP and spread < _UNLIKE * step:
                 steps[view, other] = step
     if not steps:
@@ -195,8 +196,8 @@ def _odd_bands(
     for _ in range(_MOST_ODD):
         excess = _excess(logs, wavelengths_nm)
         gains = np.median(excess, axis=0)
-        spreads = 1.4826 * np.median(np.abs(excess - gains), axis=0)
-        usual = 1.4826 * float(np.median(np.abs(gains - np.median(gains))))
+        spreads = robust_deviation(excess, axis=0)
+        usual = float(robust_deviation(gains))
         band = int(np.argmax(np.abs(gains)))
         limit = max(_BAND_GAIN, _BAND_DEVIATIONS * usual, _PIXEL_DEVIATIONS * float(spreads[band]))
         if band in found or abs(gains[band]) < limit:

@@ -28,7 +28,7 @@ from tests.captures.layouts.rig_flight import (
 from tests.captures.layouts.rig_flight import tags as tags_of
 from tests.captures.poses.pose_factory import by_hand
 from unmix_plugin.captures.cube import CameraTags, Cube, ReadOptions
-from unmix_plugin.captures.layouts.rig import _splits_of, find_rig, lens_of
+from unmix_plugin.captures.layouts.rig import find_rig, lens_of, split_shots
 from unmix_plugin.captures.names import natural_order
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.errors import CaptureError
@@ -96,7 +96,7 @@ def test_frames_have_their_band_lens_and_release_and_releases_stay_together_when
 
 def test_what_is_evaluated_lies_in_the_middle_of_a_flight():
     for count, evaluated in ((1, [0]), (2, [1]), (5, [2]), (8, [4]), (12, [4]), (20, [4, 12])):
-        splits = _splits_of([f"IMG_{number:04d}" for number in range(count)])
+        splits = split_shots([f"IMG_{number:04d}" for number in range(count)])
         assert [number for number, split in enumerate(splits.values()) if split == "eval"] == evaluated, count
 
 

@@ -13,7 +13,7 @@ Folders below images/ are the same below masks/. Sources: colmap 2599, 3611; Ope
 from __future__ import annotations
 
 import unicodedata
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,11 +32,26 @@ def with_mask_files(capture: Capture) -> Capture:
     views, folders = [], _Folders()
     for view in capture.views:
         if view.mask is None and view.alpha is None and alpha_picture(view) is None:
-            view = replace(view, mask=_find_mask(view, capture.root, folders))
-            if view.mask is None:
-                _refuse(view, capture)
+            images, candidates = {path.resolve() for path in _images(view)}, _candidates(view, capture.root)
+            found = (folders.find(folder, name) for folder, name in candidates)
+            mask = next((path for path in found if path is not None and path.resolve() not in images), None)
+            if mask is None:
+                raise _no_mask(view, candidates)
+            view = replace(view, mask=mask)
         views.append(view)
     return replace(capture, views=tuple(views))
+
+
+def _no_mask(view: CaptureView, candidates: Sequence[tuple[Path, str]]) -> CaptureError:
+    """What to say where none of the files is there that could be the mask of a view."""
+    folders = [folder for folder in dict.fromkeys(folder for folder, _ in candidates) if folder.is_dir()]
+    names = [*dict.fromkeys(name for _, name in candidates if name.endswith(".png"))]
+    has_folder = any(folder.name in MASK_FOLDERS for folder in folders)
+    return CaptureError(
+        f"--mask files: view {view.name} has no mask; expected an alpha channel, or a mask that is white where matter "
+        f"is, for every view. Looked for {name_some(names, 6)} in {name_some([str(one) for one in folders], 6)}"
+        + ("" if has_folder else "; there is no folder masks/ beside the images")
+    )
 
 
 class _Folders:
@@ -48,16 +63,13 @@ class _Folders:
     def find(self, folder: Path, name: str) -> Path | None:
         """The file of this name, in the folder or one that differs from it in capitals."""
         if folder not in self._files:
-            self._files[folder] = {_key(path.name): path for path in self._place(folder) if path.is_file()}
+            alike = [folder] if folder.is_dir() else []
+            if not alike and folder.parent.is_dir():
+                others = sorted(folder.parent.iterdir())
+                alike = [one for one in others if _key(one.name) == _key(folder.name) and one.is_dir()]
+            entries = [path for one in alike for path in sorted(one.iterdir())]
+            self._files[folder] = {_key(path.name): path for path in entries if path.is_file()}
         return self._files[folder].get(_key(name))
-
-    @staticmethod
-    def _place(folder: Path) -> list[Path]:
-        alike = [folder] if folder.is_dir() else []
-        if not alike and folder.parent.is_dir():
-            others = sorted(folder.parent.iterdir())
-            alike = [other for other in others if _key(other.name) == _key(folder.name) and other.is_dir()]
-        return [path for one in alike for path in sorted(one.iterdir())]
 
 
 def _key(name: str) -> str:
@@ -69,15 +81,6 @@ def is_mask_of(path: Path, others: Iterable[Path]) -> bool:
     files = {other.name for other in others} | {other.stem for other in others if other != path}
     marked = [path.stem.removesuffix(mark) for mark in _MARKS if path.stem.endswith(mark)]
     return any(name in files for name in marked) or (Path(path.stem).suffix != "" and path.stem in files)
-
-
-def _find_mask(view: CaptureView, root: Path, folders: _Folders) -> Path | None:
-    own = {path.resolve() for path in _images(view)}
-    for folder, name in _candidates(view, root):
-        found = folders.find(folder, name)
-        if found is not None and found.resolve() not in own:
-            return found
-    return None
 
 
 def _images(view: CaptureView) -> list[Path]:
@@ -117,15 +120,3 @@ def _mask_folders(folder: Path, root: Path) -> list[Path]:
             for inner in (own, whole.parts, ())
         )
     ]
-
-
-def _refuse(view: CaptureView, capture: Capture) -> None:
-    candidates = _candidates(view, capture.root)
-    folders = [folder for folder in dict.fromkeys(folder for folder, _ in candidates) if folder.is_dir()]
-    names = [*dict.fromkeys(name for _, name in candidates if name.endswith(".png"))]
-    has_folder = any(folder.name in MASK_FOLDERS for folder in folders)
-    raise CaptureError(
-        f"--mask files: view {view.name} has no mask; expected an alpha channel, or a mask that is white where matter "
-        f"is, for every view. Looked for {name_some(names, 6)} in {name_some([str(one) for one in folders], 6)}"
-        + ("" if has_folder else "; there is no folder masks/ beside the images")
-    )

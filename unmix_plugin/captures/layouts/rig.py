@@ -69,7 +69,7 @@ def find_rig(root: Path, options: ReadOptions) -> Capture:
             "give the folder of the flight, or use the layout 'cubes'"
         )
     sensors, shots = _sensor_names(bands), _shot_names(bands, str(root))
-    splits = _splits_of(shots)
+    splits = split_shots(shots)
     names = view_names([str(item.file.path.relative_to(root)) for item in bands], str(root))
     notes = []
     if kinds["thermal"]:
@@ -200,7 +200,7 @@ def _shot_names(bands: Sequence[_BandFile], where: str) -> list[str]:
     return [names[key] for key in keys]
 
 
-def _splits_of(shots: Iterable[str]) -> dict[str, Split]:
+def split_shots(shots: Iterable[str]) -> dict[str, Split]:
     """One of every eight shots is for evaluation, with all its lenses: in their middle, since what the first and
     the last of a flight show no other does."""
     names = sorted(set(shots), key=natural_order)

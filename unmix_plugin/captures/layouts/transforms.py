@@ -357,13 +357,14 @@ def find_nespof(root: Path, options: ReadOptions) -> Capture:
         there = [file for file in files if file is not None]
         if len(there) < len(files):
             continue
+        opacity = _opacity_channel(channel_names(there[0]))
         # The folder may be left out.
         labels = [root / "seg" / f"{stem}.png" for stem in (text, Path(text).name)]
         views.append(
             CaptureView(
                 name,
                 _stack_intensities(dict(zip(folders, there, strict=True)), options),
-                alpha=_open_opacity(there[0]),
+                alpha=None if opacity is None else open_spectral_file(there[0], ReadOptions(opacity)),
                 labels=next((path for path in labels if path.is_file()), None),
                 split=frame.split,
             )
@@ -446,12 +447,6 @@ def _open_intensity(path: Path) -> Cube:
             f"{path} has the channels {', '.join(names)}; expected s0 to s3 and maybe alpha, or Mitsuba's 16 channels"
         )
     return open_spectral_file(path, ReadOptions(named[0]))
-
-
-def _open_opacity(path: Path) -> Cube | None:
-    """The alpha channel, (H, W, 1), in [0, 1]; None where there is none."""
-    channel = _opacity_channel(channel_names(path))
-    return None if channel is None else open_spectral_file(path, ReadOptions(channel))
 
 
 def _opacity_channel(names: list[str]) -> str | None:

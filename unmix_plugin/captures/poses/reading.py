@@ -9,13 +9,13 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 from jaxtyping import Float64
 
-from unmix_plugin.captures.names import BY_ORDER, path_text
+from unmix_plugin.captures.names import BY_ORDER, path_text, size_of_view
 from unmix_plugin.captures.poses import lens as models
 from unmix_plugin.captures.poses.colmap import find_models, is_model, read_colmap
 from unmix_plugin.captures.poses.lens import Lens, bent_lens
@@ -302,10 +302,7 @@ def _size_of(
         unreadable = suppress(OSError, ValueError, Image.DecompressionBombError)
         with unreadable, open_regular(picture) as file, Image.open(file, formats=FORMATS) as opened:
             return opened.size
-    path = PurePosixPath(name.replace("\\", "/"))
-    size = next((sizes[key] for key in (name, path.name, path.stem) if key in sizes), None)
-    if size is None and len(set(sizes.values())) == 1:
-        size = next(iter(sizes.values()))
+    size = size_of_view(name, sizes)
     x, y = lens.center_px
     if size is not None and ((x or 0.0) >= size[0] or (y or 0.0) >= size[1]):
         found = ", ".join(

@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Mapping
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
 
-from unmix_plugin.captures.names import path_text
+from unmix_plugin.captures.names import path_text, size_of_view
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet, make_pose_set, read_table
 from unmix_plugin.engine.tables import Dialect, decode_text, named_rows
@@ -61,7 +61,7 @@ def read_realitycapture(path: Path, sizes: Mapping[str, tuple[int, int]]) -> Pos
         where = f"{path}, line {line}"
         x, y, height, heading, pitch, roll = (_number(row, key, dialect, where) for key in _POSE)
         name = path_text(row["name"])
-        size = _size_of(name, sizes)
+        size = size_of_view(name, sizes)
         without += [] if size else [name]
         lens = None if size is None else _lens(row, size, dialect, where)
         position = np.array([x, y, height])
@@ -92,13 +92,6 @@ def _rotation(yaw: float, pitch: float, roll: float) -> Float64[np.ndarray, "3 3
     about_x = np.array([[1.0, 0.0, 0.0], [0.0, cx, -sx], [0.0, sx, cx]])
     about_y = np.array([[cy, 0.0, sy], [0.0, 1.0, 0.0], [-sy, 0.0, cy]])
     return about_z @ about_x @ about_y
-
-
-def _size_of(name: str, sizes: Mapping[str, tuple[int, int]]) -> tuple[int, int] | None:
-    path = PurePosixPath(name)
-    found = next((sizes[key] for key in (name, path.name, path.stem) if key in sizes), None)
-    only = set(sizes.values())
-    return only.pop() if found is None and len(only) == 1 else found
 
 
 def _lens(row: Mapping[str, str], size: tuple[int, int], dialect: Dialect, where: str) -> Lens:
