@@ -17,55 +17,29 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from unmix_plugin.captures.calibration.calibration import Calibration
-from unmix_plugin.captures.cube import Capture, CaptureView
-from unmix_plugin.captures.options import ProcessOptions
+from unmix_plugin.captures.cube import CaptureView
+from unmix_plugin.captures.options import ESTIMATE, TURNTABLE, ProcessOptions
 from unmix_plugin.captures.plan import Plan
-from unmix_plugin.captures.poses.estimation import contrast_picture, estimate_poses, require_pycolmap
+from unmix_plugin.captures.poses.estimation import contrast_picture, estimate_poses
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.marker_detection import (
     Sightings,
     count_markers,
     find_markers,
     parse_family,
-    require_opencv,
 )
 from unmix_plugin.captures.poses.markers import metric_poses, poses_from_markers
 from unmix_plugin.captures.poses.pose_set import PoseSet
 from unmix_plugin.captures.poses.turntable import poses_from_turntable
 from unmix_plugin.captures.poses.turntable_evidence import parse_angles
-from unmix_plugin.captures.posing import ESTIMATE, FROM_PICTURES, MARKERS, TURNTABLE, lens_of_view
+from unmix_plugin.captures.posing import lens_of_view
 from unmix_plugin.captures.writing.view_files import FULL_SCALE, ViewRecord
-from unmix_plugin.errors import CaptureError, ConfigError
+from unmix_plugin.errors import CaptureError
 from unmix_plugin.scenes.reading.cubes import map_array
 
-_MARKER_SIZES_M = (0.0005, 20.0)
 _SAMPLE_VIEWS, _SAMPLE_BANDS = 6, 8
 """In which it is tried what shows the most markers."""
 _BLOCK_VALUES = 1 << 22
-
-
-def check_pose_options(options: ProcessOptions, capture: Capture) -> None:
-    """Refuse what does not fit together, before anything is read. Raises ConfigError: a flag is wrong, or asks for what
-    this way of finding poses does not use. Raises CaptureError: OpenCV is not installed."""
-    found = options.poses in FROM_PICTURES
-    for flag, value in (("--marker-size", options.marker_size), ("--marker-family", options.marker_family)):
-        if value is not None and not found:
-            raise ConfigError(f"{flag} goes with --poses {', '.join(FROM_PICTURES)}; give one of them")
-    if options.marker_family is not None and options.marker_size is None and options.poses != MARKERS:
-        raise ConfigError("--marker-family needs --marker-size, the side of a marker in metres")
-    low, high = _MARKER_SIZES_M
-    if options.marker_size is not None and not low <= options.marker_size <= high:
-        raise ConfigError(f"--marker-size {options.marker_size:g}: expected metres, {low} to {high:g}")
-    if options.marker_family is not None:
-        parse_family(options.marker_family)
-    if (options.angles is None) == (options.poses == TURNTABLE):
-        raise ConfigError(f"--poses {TURNTABLE} and --angles go together, such as --angles 0:360:10")
-    if options.angles is not None:
-        parse_angles(options.angles, capture.names)
-    if options.poses in (MARKERS, TURNTABLE) or options.marker_size is not None:
-        require_opencv()
-    if options.poses == ESTIMATE:
-        require_pycolmap()
 
 
 def marked_poses(plan: Plan, options: ProcessOptions) -> PoseSet:

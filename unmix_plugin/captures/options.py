@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from importlib import import_module
 from pathlib import Path
@@ -12,6 +12,9 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from unmix_plugin.captures.cube import Axes, Capture, ReadOptions
+from unmix_plugin.captures.poses.estimation import require_pycolmap
+from unmix_plugin.captures.poses.marker_detection import parse_family, require_opencv
+from unmix_plugin.captures.poses.turntable_evidence import parse_angles
 from unmix_plugin.errors import CaptureError, ConfigError, did_you_mean
 
 _LAYOUTS = {
@@ -29,6 +32,10 @@ GONE_LAYOUTS = {
     "hs-nerf": "save its .pt tensors as .npy (numpy.save), name these in transforms.json and take the layout unmix-nerf"
 }
 """Layouts that earlier releases had, and what to do."""
+
+FROM_PICTURES = ESTIMATE, MARKERS, TURNTABLE = "estimate", "markers", "turntable"
+"""Words of --poses that ask to find poses instead of reading them."""
+_MARKER_SIZES_M = (0.0005, 20.0)
 
 MaskKind = Literal["auto", "files", "white", "black", "none"]
 
@@ -129,6 +136,35 @@ def check_options(options: ProcessOptions) -> None:
         raise ConfigError(f"--saturation {options.saturation:g}: expected a stored number above 0")
     if not options.max_noise > 0:
         raise ConfigError(f"--max-noise {options.max_noise:g}: expected a share above 0")
+
+
+def check_pose_options(options: ProcessOptions, names: Sequence[str]) -> None:
+    """Refuse what does not go together in finding poses, before anything is computed.
+
+    Args:
+        names: Of all views.
+    Raises:
+        ConfigError: an option is wrong, or asks for what this way of finding poses does not use.
+        CaptureError: a library that is needed is not installed.
+    """
+    for flag, value in (("--marker-size", options.marker_size), ("--marker-family", options.marker_family)):
+        if value is not None and options.poses not in FROM_PICTURES:
+            raise ConfigError(f"{flag} goes with --poses {', '.join(FROM_PICTURES)}; give one of them")
+    if options.marker_family is not None and options.marker_size is None and options.poses != MARKERS:
+        raise ConfigError("--marker-family needs --marker-size, the side of a marker in metres")
+    low, high = _MARKER_SIZES_M
+    if options.marker_size is not None and not low <= options.marker_size <= high:
+        raise ConfigError(f"--marker-size {options.marker_size:g}: expected metres, {low} to {high:g}")
+    if options.marker_family is not None:
+        parse_family(options.marker_family)
+    if (options.angles is None) == (options.poses == TURNTABLE):
+        raise ConfigError(f"--poses {TURNTABLE} and --angles go together, such as --angles 0:360:10")
+    if options.angles is not None:
+        parse_angles(options.angles, names)
+    if options.poses in (MARKERS, TURNTABLE) or options.marker_size is not None:
+        require_opencv()
+    if options.poses == ESTIMATE:
+        require_pycolmap()
 
 
 def parse_mosaic(text: str | None) -> tuple[int, int] | None:

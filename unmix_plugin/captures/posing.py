@@ -28,7 +28,7 @@ from jaxtyping import Float64
 from unmix_plugin.captures.camera_tags import tag_numbers
 from unmix_plugin.captures.cube import Capture, CaptureView
 from unmix_plugin.captures.names import match_poses
-from unmix_plugin.captures.options import ProcessOptions
+from unmix_plugin.captures.options import ESTIMATE, MARKERS, TURNTABLE, ProcessOptions
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera, PoseSet, where_rays_meet
 from unmix_plugin.captures.poses.reading import read_poses
@@ -38,8 +38,6 @@ from unmix_plugin.errors import CaptureError, ConfigError, did_you_mean
 from unmix_plugin.scenes.folder import METRES_KEY
 from unmix_plugin.scenes.placement import Placement
 
-FROM_PICTURES = ESTIMATE, MARKERS, TURNTABLE = "estimate", "markers", "turntable"
-"""Words that ask to find poses instead of reading them."""
 _LEAST_VIEWS = 2
 """One to train on and one for evaluation."""
 _MOST_UNPOSED = 0.25

@@ -18,18 +18,24 @@ from unmix_plugin.captures.cube import (
     ReadOptions,
 )
 from unmix_plugin.captures.decisions import decisions_of
-from unmix_plugin.captures.finding_poses import check_pose_options, marked_poses, poses_of_written_views
+from unmix_plugin.captures.finding_poses import marked_poses, poses_of_written_views
 from unmix_plugin.captures.layouts.masks import with_mask_files
 from unmix_plugin.captures.match_checks import views_of_other_poses
-from unmix_plugin.captures.options import ProcessOptions, check_options, find_views, parse_mosaic
-from unmix_plugin.captures.plan import Plan, make_plan
-from unmix_plugin.captures.poses.lens import Lens
-from unmix_plugin.captures.poses.pose_set import PosedCamera
-from unmix_plugin.captures.posing import (
+from unmix_plugin.captures.options import (
     ESTIMATE,
     FROM_PICTURES,
     MARKERS,
     TURNTABLE,
+    ProcessOptions,
+    check_options,
+    check_pose_options,
+    find_views,
+    parse_mosaic,
+)
+from unmix_plugin.captures.plan import Plan, make_plan
+from unmix_plugin.captures.poses.lens import Lens
+from unmix_plugin.captures.poses.pose_set import PosedCamera
+from unmix_plugin.captures.posing import (
     PosedViews,
     asked_distance,
     given_poses,
@@ -82,7 +88,7 @@ def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list
     references = _open_references(options)
     capture = _open_capture(options, references)
     say(f"{capture.root}: {len(capture.views)} views of the layout {capture.layout}")
-    check_pose_options(options, capture)
+    check_pose_options(options, capture.names)
     known = asked_distance(options, capture.views)
     wanted, left_out = _wanted_views(capture, options)
 
