@@ -19,10 +19,10 @@ from tests.captures.layouts.data_sets import (
 )
 from unmix_plugin.captures.cube import ReadOptions
 from unmix_plugin.captures.layouts.transforms import (
-    _open_intensity,
-    _open_opacity,
     find_nespof,
     find_nespof_real,
+    open_intensity,
+    open_opacity,
 )
 from unmix_plugin.captures.readers.exr import channel_names
 from unmix_plugin.errors import CaptureError
@@ -74,18 +74,18 @@ def test_labels_lie_in_seg_and_views_of_one_name_in_two_splits_keep_their_folder
 def test_raw_files_of_mitsuba_have_the_intensity_in_the_fifth_channel(tmp_path, kind):
     names = [f"ch{index:02d}" for index in range(16)]
     write_exr(tmp_path / "a.exr", {name: np.full((3, 4), float(i)) for i, name in enumerate(names)}, kind)
-    assert (_open_intensity(tmp_path / "a.exr").read() == 4.0).all()
-    assert _open_opacity(tmp_path / "a.exr") is None
+    assert (open_intensity(tmp_path / "a.exr").read() == 4.0).all()
+    assert open_opacity(tmp_path / "a.exr") is None
 
 
 def test_channels_are_known_by_name_wherever_they_stand_and_others_are_refused(tmp_path):
     path = tmp_path / "a.exr"
     write_exr(path, {"A": np.full((3, 4), 0.5), **stokes(np.full((3, 4), 2.0))})
-    assert (_open_intensity(path).read() == 2.0).all()
-    assert (present(_open_opacity(path)).read() == 0.5).all()
+    assert (open_intensity(path).read() == 2.0).all()
+    assert (present(open_opacity(path)).read() == 0.5).all()
     write_exr(path, {"R": np.zeros((3, 4)), "G": np.zeros((3, 4))})
     with pytest.raises(CaptureError, match="has the channels G, R; expected s0 to s3"):
-        _open_intensity(path)
+        open_intensity(path)
 
 
 def _outside(root):

@@ -357,14 +357,13 @@ def find_nespof(root: Path, options: ReadOptions) -> Capture:
         there = [file for file in files if file is not None]
         if len(there) < len(files):
             continue
-        opacity = _opacity_channel(channel_names(there[0]))
         # The folder may be left out.
         labels = [root / "seg" / f"{stem}.png" for stem in (text, Path(text).name)]
         views.append(
             CaptureView(
                 name,
                 _stack_intensities(dict(zip(folders, there, strict=True)), options),
-                alpha=None if opacity is None else open_spectral_file(there[0], ReadOptions(opacity)),
+                alpha=open_opacity(there[0]),
                 labels=next((path for path in labels if path.is_file()), None),
                 split=frame.split,
             )
@@ -421,7 +420,7 @@ def _wavelength_entries(folder: Path, *, is_file: bool) -> dict[float, Path]:
 
 def _stack_intensities(files: dict[float, Path], options: ReadOptions) -> Cube:
     """Files of one view by their wavelength, as one cube."""
-    parts = [_open_intensity(file) for file in files.values()]
+    parts = [open_intensity(file) for file in files.values()]
     stack, given = stack_bands(parts, parts[0].path), options.wavelengths_nm
     if given is None:
         bands = BandTable(np.array(list(files), dtype=np.float64), "names of the folders or files, nm")
@@ -433,7 +432,7 @@ def _stack_intensities(files: dict[float, Path], options: ReadOptions) -> Cube:
     return replace(stack, bands=bands)
 
 
-def _open_intensity(path: Path) -> Cube:
+def open_intensity(path: Path) -> Cube:
     """The first Stokes component, (H, W, 1): by its name, otherwise by the number of channels. Raises CaptureError: the
     file can't be read, or which channel is s0 can't be told."""
     names = channel_names(path)
@@ -447,6 +446,12 @@ def _open_intensity(path: Path) -> Cube:
             f"{path} has the channels {', '.join(names)}; expected s0 to s3 and maybe alpha, or Mitsuba's 16 channels"
         )
     return open_spectral_file(path, ReadOptions(named[0]))
+
+
+def open_opacity(path: Path) -> Cube | None:
+    """The alpha channel, (H, W, 1), in [0, 1]; None where there is none."""
+    channel = _opacity_channel(channel_names(path))
+    return None if channel is None else open_spectral_file(path, ReadOptions(channel))
 
 
 def _opacity_channel(names: list[str]) -> str | None:
