@@ -20,5 +20,5 @@ def robust_deviation(values: np.ndarray, axis: int | tuple[int, ...] | None = No
     >>> round(float(robust_deviation(np.array([1.0, 2.0, 3.0, 1000.0]))), 4)
     1.4826
     """
-    middle = np.median(values, axis=axis, keepdims=True)
-    return 1.4826 * np.asarray(np.median(np.abs(values - middle), axis=axis), np.float64)
+    away = np.abs(values - np.median(values, axis=axis, keepdims=True))
+    return np.asarray(1.4826 * np.asarray(np.median(away, axis=axis), np.float64))
