@@ -16,6 +16,7 @@ from unmix_plugin.trained.view_fit import (
     Misfit,
     ViewFit,
     describe_misfits,
+    left_by_best_shift,
     misfits,
     read_misfits,
     write_fits,
@@ -47,6 +48,18 @@ def test_what_is_wrong_is_what_makes_the_error_smaller(name):
     assert describe_misfits({"spoilt": reason})[0].startswith(
         f"spoilt does not fit the other views: {reason.value}"
     )
+
+
+def test_a_shift_explains_a_moved_picture_but_no_error_at_the_border_alone():
+    rng = np.random.default_rng(0)
+    rendered = ndimage.gaussian_filter(rng.random((40, 48)), 2)
+    counts = np.ones(rendered.shape, dtype=bool)
+    moved = np.roll(rendered, (2, -1), axis=(0, 1))
+    assert left_by_best_shift(moved, rendered, counts) < 1e-6
+    at_the_border = rendered + 0.01 * rng.standard_normal(rendered.shape)
+    at_the_border[:3] += 1.0
+    assert left_by_best_shift(at_the_border, rendered, counts) > 0.9
+    assert left_by_best_shift(moved, rendered, np.zeros_like(counts)) == 1.0
 
 
 def test_no_view_is_named_where_all_fit_where_many_do_not_or_where_there_are_few():

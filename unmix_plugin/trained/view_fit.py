@@ -116,13 +116,12 @@ def _fit(
     error = float(np.sqrt(np.mean(away**2)))
     grey, shown = measured.mean(axis=2), rendered.mean(axis=2)
     contrast = [_fine_contrast(picture, counts) for picture in (grey, shown)]
-    of_grey = float(np.sqrt(np.mean((grey - shown)[counts] ** 2)))
     return ViewFit(
         name=view.name,
         error=error,
         factor=factor,
         error_of_factor=float(np.sqrt(np.mean((own - factor * other) ** 2))) / scale,
-        error_of_shift=error * _best_shift(grey, shown, counts) / max(of_grey, 1e-12),
+        error_of_shift=error * left_by_best_shift(grey, shown, counts),
         sharpness=contrast[0] / max(contrast[1], 1e-12),
         spread=float((away > 0.5 * error).mean()),
     )
@@ -137,20 +136,27 @@ def _fine_contrast(picture: Float64[np.ndarray, "h w"], counts: Bool[np.ndarray,
     return float(np.sqrt(np.mean(np.concatenate(squares)))) if sum(map(len, squares)) else 0.0
 
 
-def _best_shift(
+def left_by_best_shift(
     measured: Float64[np.ndarray, "h w"],
     rendered: Float64[np.ndarray, "h w"],
     counts: Bool[np.ndarray, "h w"],
 ) -> float:
-    """Least root mean square difference over shifts of what is rendered by whole pixels."""
+    """Share of the root mean square difference that is left by the best shift of what is rendered by whole pixels.
+
+    Both are taken over the same pixels, those that no shift brings in from beyond the picture; 1 where none counts.
+    """
     most = min(_FURTHEST_SHIFT, (min(measured.shape) - 1) // 4)
     inner = np.s_[most : measured.shape[0] - most, most : measured.shape[1] - most]
-    kept, found = counts[inner], []
+    kept = counts[inner]
+    unmoved = float(np.mean((measured - rendered)[inner][kept] ** 2)) if kept.any() else 0.0
+    if not unmoved > 0:
+        return 1.0
+    least = unmoved
     for down in range(-most, most + 1):
         for across in range(-most, most + 1):
             moved = np.roll(rendered, (down, across), axis=(0, 1))
-            found.append(float(np.mean((measured - moved)[inner][kept] ** 2)) if kept.any() else np.inf)
-    return float(np.sqrt(min(found)))
+            least = min(least, float(np.mean((measured - moved)[inner][kept] ** 2)))
+    return float(np.sqrt(least / unmoved))
 
 
 def misfits(fits: Sequence[ViewFit]) -> dict[str, Misfit]:
@@ -182,10 +188,12 @@ def misfits(fits: Sequence[ViewFit]) -> dict[str, Misfit]:
 
 
 def describe_misfits(found: dict[str, Misfit]) -> list[str]:
-    """A sentence a view."""
-    advice = "leave it out with --leave-out of unmix-process, or mend it"
+    """A sentence per view."""
+    mend = "leave it out with --leave-out of unmix-process, or mend it"
+    look = "look at it: a fault if something stood in the way, none if it alone sees a place"
     return [
-        f"{name} does not fit the other views: {reason.value}; {advice}" for name, reason in found.items()
+        f"{name} does not fit the other views: {reason.value}; {look if reason is Misfit.CONTENT else mend}"
+        for name, reason in found.items()
     ]
 
 
