@@ -1,8 +1,8 @@
-"""Makes the pictures of docs/pictures: `python scripts/gallery.py --scenes DIR [NAME ...]`.
+"""Makes the pictures of docs/pictures: `python scripts/gallery.py [NAME ...]`.
 
-DIR holds the scenes vnir-pots, still-life and turntable of the benchmarks; the built-in scene is made here. Each is
-trained once, for `--seconds`, into `--work`; later calls find the runs there. Names choose pictures, all by default.
-Pictures of browsers need chromium.
+The scenes table, pots and turntable are those of `make scenes`; the built-in scene is made here. Each is trained once,
+for `--seconds`, into `--work`, where runs of `quality.py --runs WORK/runs` do as well. Names choose pictures,
+all by default. Pictures of browsers need chromium.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import io
 import shutil
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -38,13 +39,11 @@ from unmix_plugin.spectral.colour.conversion import linear_to_srgb
 from unmix_plugin.trained.run_materials import endmember_colours
 from unmix_plugin.trained.run_views import cameras_of
 
-PICTURES = Path(__file__).resolve().parents[1] / "docs/pictures"
-SETTINGS = {
-    "vnir-pots": {"endmembers": 6},
-    "still-life": {"endmembers": 7},
-    "turntable": {"endmembers": 6, "light": "camera"},
-    "demo": {"endmembers": 6},
-}
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.append(str(ROOT))
+from benchmarks import _common  # noqa: E402 - of the repository, in no wheel
+
+PICTURES = ROOT / "docs/pictures"
 NDVI = Output("index:ndvi", "map", "NDVI", "NDVI", (-0.1, 0.9), "RdYlGn")
 INK, SOFT = "#1f2328", "#656d76"
 
@@ -52,14 +51,15 @@ INK, SOFT = "#1f2328", "#656d76"
 class Studio:
     """Where scenes are, and the runs of them."""
 
-    def __init__(self, scenes: Path, work: Path, seconds: float) -> None:
+    def __init__(self, scenes: Path | None, work: Path, seconds: float) -> None:
         self.scenes, self.work, self.seconds = scenes, work, seconds
         self._opened: dict[str, TrainedScene] = {}
 
     def data(self, name: str) -> Path:
         """A scene's folder."""
         if name != "demo":
-            return self.scenes / name
+            [folder] = _common.scene_folders(self.scenes, (name,))
+            return folder
         folder = self.work / "scenes/demo"
         if not folder.exists():
             make_demo_scene(folder, 192, 31, 40)
@@ -70,7 +70,9 @@ class Studio:
         found = sorted((self.work / "runs" / name / "unmix-nerf").glob("*/"))
         if found:
             return found[-1]
-        train(self.data(name), output_dir=self.work / "runs", max_seconds=self.seconds, **SETTINGS[name])
+        data = self.data(name)
+        num_endmembers = len(_table(data / "endmembers.csv")[0])
+        train(data, output_dir=self.work / "runs", max_seconds=self.seconds, endmembers=num_endmembers)
         return self.run(name)
 
     def named(self, name: str) -> list[str]:
@@ -213,7 +215,7 @@ def save(figure: Figure, path: Path) -> None:
 
 def make_orbit(studio: Studio) -> None:
     """Potted plants going round: as the eye sees them, with infrared, as materials."""
-    scene = studio.scene("vnir-pots")
+    scene = studio.scene("pots")
     colours = endmember_colours(scene.materials)
     cameras = orbit(cameras_of(scene.views, "train"), scene.scene_box, 40)
     frames = []
@@ -258,7 +260,7 @@ def make_measured(studio: Studio) -> None:
 
 def make_materials(studio: Studio) -> None:
     """What a scene is made of: its materials, their spectra, and where each is."""
-    scene = studio.scene("still-life")
+    scene = studio.scene("table")
     colours, names = endmember_colours(scene.materials), scene.materials.names
     view = look(scene, evaluation(scene, 2), 400, 330, 1.1)
     figure = plt.figure(figsize=(11, 5.6), facecolor="white")
@@ -307,7 +309,7 @@ def make_plant(studio: Studio) -> None:
 
 def make_lights(studio: Studio) -> None:
     """One scene in four lights."""
-    scene = studio.scene("still-life")
+    scene = studio.scene("table")
     camera = evaluation(scene, 0)
     row = []
     for name, title in (
@@ -323,13 +325,13 @@ def make_lights(studio: Studio) -> None:
 
 def make_edits(studio: Studio) -> None:
     """Materials changed: the run stays as it is."""
-    scene = studio.scene("still-life")
+    scene = studio.scene("table")
     camera = evaluation(scene, 0)
     recipes: list[tuple[str, tuple[Operation, ...]]] = [
         ("as it was taken", ()),
-        ("cobalt recoloured", (Retint("cobalt", (0.85, 0.55, 0.1)),)),
-        ("wood replaced", (Replace("wood", "checker/foliage"),)),
-        ("cream removed", (Remove(("cream",)),)),
+        ("blue recoloured", (Retint("blue flower", (0.85, 0.55, 0.1)),)),
+        ("red replaced", (Replace("red", "checker/foliage"),)),
+        ("white removed", (Remove(("white card",)),)),
     ]
     row = [
         (title, colour(look(edit_scene(scene, Recipe(edits)), camera, 360, 300, 1.1)))
@@ -359,7 +361,7 @@ def make_page(studio: Studio) -> None:
     export(
         [
             "page",
-            *studio.named("vnir-pots"),
+            *studio.named("pots"),
             "--output",
             str(folder),
             "--title",
@@ -382,7 +384,7 @@ def make_viewer(studio: Studio) -> None:
     from unmix_plugin.commands.view import ViewOptions, prepared
     from unmix_plugin.viewer.access import ViewerOptions
 
-    _, run, _, names = studio.named("still-life")
+    _, run, _, names = studio.named("table")
     served = prepared(
         ViewOptions(run=Path(run), edits=Path(names), device="cpu", viewer=ViewerOptions(port=0))
     )
@@ -418,7 +420,9 @@ def main() -> None:
     """Console entry."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("names", nargs="*", choices=[*MAKERS, []], help="pictures to make; all by default")
-    parser.add_argument("--scenes", type=Path, required=True, help="folder of the scenes")
+    parser.add_argument(
+        "--scenes", type=Path, help="folder of the scenes; by default where make scenes writes them"
+    )
     parser.add_argument("--work", type=Path, default=Path("outputs/gallery"), help="where runs are kept")
     parser.add_argument("--seconds", type=float, default=175.0, help="length of each training")
     given = parser.parse_args()
