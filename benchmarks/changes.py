@@ -127,7 +127,7 @@ def judged(found: Comparison, change: Planted) -> dict[str, Any]:
             name: part(np.nan_to_num(one.p, nan=1.0) <= NOMINAL, ~planted & np.isfinite(one.p))
             for name, one in found.differences.items()
         },
-        "places": [[place.what, place.area, place.p, place.said()] for place in found.places],
+        "places": [[place.what, place.area, place.p, place.in_words()] for place in found.places],
     }
 
 

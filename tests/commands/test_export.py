@@ -168,7 +168,7 @@ def test_a_known_distance_is_kept_and_exports_say_it(solid_copy, tmp_path):
     done(export, *words("poses", "--run", solid_copy, "--output", tmp_path))
     written = json.loads((tmp_path / "transforms.json").read_text())
     assert written["metres_per_unit"] == scene.scale.metres_per_unit
-    assert scene.scale.said in run(export, *known).out
+    assert scene.scale.in_words in run(export, *known).out
     for given, message in (
         (["--points", "eval_002:7,8", "eval_002:9,8", "--distance", 0], "must be greater than 0"),
         (["--points", "0 0 90", "eval_002:9,8", "--distance", 1], "is not on the object"),

@@ -18,7 +18,7 @@ from tests.comparing.objects import (
     surface_of_shape,
 )
 from unmix_plugin.comparing.comparison import compare
-from unmix_plugin.comparing.files import place_rows, summary, told
+from unmix_plugin.comparing.files import place_rows, summary, summary_lines
 from unmix_plugin.comparing.materials import join_materials
 from unmix_plugin.comparing.series import series_rows
 from unmix_plugin.errors import ConfigError
@@ -63,7 +63,7 @@ def test_an_unchanged_object_has_no_places(surface):
     np.testing.assert_allclose(found.registration.light, 1.2, rtol=0.01)
     for name in ("spectrum", "brightness", "distance"):
         assert abs(np.nanmean(found.differences[name].p <= 0.05) - 0.05) <= 0.03
-    assert "nothing has changed" in told(found)[-1]
+    assert "nothing has changed" in summary_lines(found)[-1]
 
 
 def test_more_of_a_material_is_found_where_it_is_and_by_how_much(stained, surface, spot, elsewhere):

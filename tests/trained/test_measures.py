@@ -25,7 +25,7 @@ def test_two_points_and_their_distance_tell_the_unit(tmp_path):
     scale = measures.scale_between((1.0, 2.0, 3.0), (1.0, 2.0, 3.5), 0.12)
     assert scale.metres_per_unit == pytest.approx(0.24)
     assert (measures.describe_length(0.5, scale), measures.describe_area(0.5, scale)) == ("12 cm", "288 cm²")
-    assert "0.12 m between 1 2 3 and 1 2 3.5" in scale.said
+    assert "0.12 m between 1 2 3 and 1 2 3.5" in scale.in_words
     run = RunFolder(tmp_path)
     assert measures.read_measures(run).scale is None
     measures.keep_scale(run, scale)

@@ -65,7 +65,7 @@ def _compare_all(options: CompareOptions) -> None:
     from unmix_plugin.commands.reporting import CommandConsole, follow, working
     from unmix_plugin.comparing import comparison as comparing
     from unmix_plugin.comparing.captured import open_capture
-    from unmix_plugin.comparing.files import ChangeFiles, told
+    from unmix_plugin.comparing.files import ChangeFiles, summary_lines
     from unmix_plugin.comparing.series import series_rows
     from unmix_plugin.formats.files import csv_bytes, numbered_apart, refuse_to_overwrite, write_file
 
@@ -95,7 +95,7 @@ def _compare_all(options: CompareOptions) -> None:
         )
         if is_series:
             tell(f"{path}:")
-        for line in told(result):
+        for line in summary_lines(result):
             tell(line)
         written = one.write(result)
         tell(f"{one.folder / 'changes.html'}  before and after, what differs, and the places")

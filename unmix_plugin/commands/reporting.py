@@ -113,11 +113,11 @@ def follow(console: Console, doing: str, items: Sequence[ItemT]) -> Iterator[Ite
 
         yield from track(items, doing, console=console, transient=True)
         return
-    said_at = time.monotonic()
+    printed_at = time.monotonic()
     for done, item in enumerate(items):
-        if done == 0 or time.monotonic() - said_at >= _PLAIN_INTERVAL_S:
+        if done == 0 or time.monotonic() - printed_at >= _PLAIN_INTERVAL_S:
             say(console, f"{doing}: {done} of {len(items)} done")
-            said_at = time.monotonic()
+            printed_at = time.monotonic()
         yield item
 
 

@@ -146,7 +146,7 @@ def compare(
         raise ConfigError(f"the level is {level:g}; give a probability above 0 and below 1, such as 0.05")
     bands, to_common, notes = _common_bands(before, after)
     maps = {name: parse_index(name, bands) for name in indices}  # refused before anything is rendered
-    choice, ratio, said = _scale_choice(before, after, scale)
+    choice, ratio, scale_notes = _scale_choice(before, after, scale)
     surfaces = []
     for capture, matrix in zip((before, after), to_common, strict=True):
         found = capture.surface(follow, working)
@@ -168,7 +168,7 @@ def compare(
     unseen = 1 - float(surface.areas[found.known].sum() / surface.areas.sum())
     if unseen > _MUCH_UNSEEN:
         notes += (f"{unseen:.0%} of the first surface is not seen by enough views of both captures",)
-    return replace(found, notes=(*notes, *said, *found.notes))
+    return replace(found, notes=(*notes, *scale_notes, *found.notes))
 
 
 _MUCH_UNSEEN = 0.3
@@ -347,11 +347,11 @@ def _distances(
         own = np.where(enough, one.mean[:, 0], np.nan)
         roughness.append(smooth.places(np.abs(smooth.places(own, 1) - own), 3))
     normals = np.stack([smooth.places(axis, 6) for axis in surface.normals.T], axis=1)
-    bent = 1 - np.linalg.norm(normals, axis=1)
+    curvature = 1 - np.linalg.norm(normals, axis=1)
     off = smooth.places(np.abs(np.where(enough, moments[0].mean[:, 0], np.nan)), 3)
     few = np.minimum(moments[0].count, moments[1].count)
     features = [np.log(one + 0.02) for one in spreads] + [np.log(one + 0.03) for one in (*roughness, off)]
-    features += [np.log(bent.clip(min=0) + 1e-3), np.log(few + 1.0)]
+    features += [np.log(curvature.clip(min=0) + 1e-3), np.log(few + 1.0)]
     found = difference_of_heights(smooth.places(change, _HEIGHT_RINGS), np.stack(features, axis=1))
     return replace(found, mean=found.mean * before.pixel, error=found.error * before.pixel)
 

@@ -85,7 +85,7 @@ def _number(value: float) -> str:
 def place_rows(comparison: Comparison) -> Iterable[Sequence[object]]:
     """A row for each place: where, how large, what, by how much with intervals, how sure."""
     names = [name for name in comparison.differences if name != "spectrum"]
-    head = ["place", "what", "area", "area_said", "x", "y", "z", "p_corrected", "spectral_angle_rad"]
+    head = ["place", "what", "area", "area_in_words", "x", "y", "z", "p_corrected", "spectral_angle_rad"]
     for name in names:
         plain = name.replace(" ", "_")
         plain = "brightness_factor" if name == "brightness" else plain
@@ -132,10 +132,10 @@ def summary(comparison: Comparison) -> dict[str, Any]:
     }
 
 
-def told(comparison: Comparison) -> list[str]:
+def summary_lines(comparison: Comparison) -> list[str]:
     """What a user is told first."""
     places = comparison.places
-    lines = [*comparison.notes, comparison.registration.said(), comparison.materials.said()]
+    lines = [*comparison.notes, comparison.registration.in_words(), comparison.materials.in_words()]
     light = comparison.registration.light
     lines.append(
         f"light: {np.median(light):.3g} times ({light.min():.3g} to {light.max():.3g} over the bands)"
@@ -148,7 +148,7 @@ def told(comparison: Comparison) -> list[str]:
     for place in places[:5]:
         area = describe_area(place.area, comparison.before.scale)
         where = " ".join(f"{value:.3g}" for value in place.center)
-        what = place.said()
+        what = place.in_words()
         if place.what == "distance":
             size = describe_length(abs(place.amounts["distance"].mean), comparison.before.scale)
             what = f"surface {'raised' if place.amounts['distance'].mean > 0 else 'lowered'} by {size}"

@@ -33,7 +33,7 @@ class JoinedMaterials:
     new: tuple[str, ...]
     """On the second surface only."""
 
-    def said(self) -> str:
+    def in_words(self) -> str:
         """What became of the materials, for people."""
         text = f"{len(self.pairs)} of the materials are in both captures"
         text += f"; new: {', '.join(self.new)}" if self.new else ""

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from unmix_plugin.comparing.comparison import Comparison
-from unmix_plugin.comparing.printed import amount_said
+from unmix_plugin.comparing.printed import amount_in_words
 from unmix_plugin.comparing.shown import ChangeMap, ShownView, strip
 from unmix_plugin.errors import counted
 from unmix_plugin.figures.pictures import Picture
@@ -58,7 +58,7 @@ def _facts(comparison: Comparison) -> list[tuple[str, str]]:
         ),
         ("Registration", f"{found.rms_px:.2f} pixels rms, {found.overlap:.0%} overlap"),
         ("Light, after over before", f"{np.median(light):.3g} ({light.min():.3g} to {light.max():.3g})"),
-        ("Materials", comparison.materials.said()),
+        ("Materials", comparison.materials.in_words()),
         ("Bands", str(comparison.bands)),
         ("Lengths", describe_scale(comparison.before.scale)),
         ("False discoveries", f"at most {comparison.level:.0%} of the changed vertices"),
@@ -72,7 +72,7 @@ def _rows(comparison: Comparison) -> list[dict[str, str | int]]:
             "what": place.what,
             "area": describe_area(place.area, comparison.before.scale),
             "center": ", ".join(f"{value:.3g}" for value in place.center),
-            "amount": amount_said(comparison, place.number),
+            "amount": amount_in_words(comparison, place.number),
             "angle": _number(place.angle, 3),
             "brightness": _number(place.amounts["brightness"].mean, 2),
             "p": f"{place.p:.2g}",

@@ -56,7 +56,7 @@ class ChangedPlace:
     amounts: Mapping[str, Amount]
     """By quantity, as `Comparison.differences` names them: brightness as a factor, others as differences."""
 
-    def said(self) -> str:
+    def in_words(self) -> str:
         """What changed most, for people."""
         largest = max(
             (name for name in self.amounts if name.startswith("abundance ")),

@@ -46,17 +46,17 @@ def _first_page(comparison: Comparison):  # noqa: ANN202 - a figure of matplotli
     line(f"What has changed: {comparison.before.name}, {comparison.after.name}", 15, fontweight="bold")
     top -= 2 * _LINE
     light = comparison.registration.light
-    said = [
-        comparison.registration.said(),
+    sentences = [
+        comparison.registration.in_words(),
         f"light after over before: {np.median(light):.3g} ({light.min():.3g} to {light.max():.3g} over the bands)",
         str(comparison.bands),
-        comparison.materials.said(),
+        comparison.materials.in_words(),
         describe_scale(comparison.before.scale),
         f"changed: {comparison.changed_area:.2%} of what both see, {counted(len(comparison.places), 'place')}",
         f"false discoveries: at most {comparison.level:.0%} of the changed vertices",
         *comparison.notes,
     ]
-    for text in said:
+    for text in sentences:
         for row in wrap(text, _LETTERS):
             line(row)
             top -= _LINE
@@ -73,7 +73,7 @@ def _first_page(comparison: Comparison):  # noqa: ANN202 - a figure of matplotli
             " ".join(f"{value:.3g}" for value in place.center),
             f"{place.p:.2g}",
             f"{place.angle:.3f}",
-            amount_said(comparison, place.number),
+            amount_in_words(comparison, place.number),
         )
         for left, text in zip(_COLUMNS, cells, strict=True):
             line(text, 8, left)
@@ -83,7 +83,7 @@ def _first_page(comparison: Comparison):  # noqa: ANN202 - a figure of matplotli
     return figure
 
 
-def amount_said(comparison: Comparison, number: int) -> str:
+def amount_in_words(comparison: Comparison, number: int) -> str:
     """How much stands out most at a place, with its interval."""
     place = comparison.places[number - 1]
     if place.what == "distance":
@@ -97,8 +97,8 @@ def amount_said(comparison: Comparison, number: int) -> str:
     amount = place.amounts[name]
     if not amount.low * amount.high > 0:
         return text
-    said = f"{name.removeprefix('abundance ')} {amount.low:+.2f} to {amount.high:+.2f}"
-    return f"{text}, {said}" if place.what == "brightness" else said
+    change = f"{name.removeprefix('abundance ')} {amount.low:+.2f} to {amount.high:+.2f}"
+    return f"{text}, {change}" if place.what == "brightness" else change
 
 
 def _view_page(comparison: Comparison, view: ShownView, maps: Sequence[ChangeMap]):  # noqa: ANN202 - the same

@@ -86,7 +86,7 @@ class Registration:
     light: Float64[np.ndarray, " B"]
     """The second capture's radiance over the first's, of places that did not change; one number for each band."""
 
-    def said(self) -> str:
+    def in_words(self) -> str:
         """How well they fit, for people."""
         return (
             f"registered: rms {self.rms_px:.2f} pixels where both surfaces are, which is {self.overlap:.0%} of the "

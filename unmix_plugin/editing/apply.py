@@ -364,7 +364,7 @@ def edit_scene(
         except UnmixError as error:
             raise ConfigError(f"{where}: {error}") from error
     _require_names_that_differ(state, recipe)
-    factors, told = light_factors(scene, recipe)
+    factors, light_notes = light_factors(scene, recipe)
     materials = replace(
         scene.materials,
         names=tuple(state.names),
@@ -380,7 +380,7 @@ def edit_scene(
             light_name=asked.stem if isinstance(asked, Path) else asked,
         )
     assumed = assumption_of_light(scene, recipe)
-    notes = [*scene.notes, *([] if assumed is None else [assumed]), *state.notes, *told]
+    notes = [*scene.notes, *([] if assumed is None else [assumed]), *state.notes, *light_notes]
     edited = _with_visibility(scene, state)
     return replace(
         edited,

@@ -155,7 +155,7 @@ class LitSurface:
     """How samples look in a lamp's light."""
 
     brightness: Column
-    """Of a matt surface, in [0, 1]: 1 where the lamp shines on it squarely."""
+    """Of a matt surface, in [0, 1]: 1 where the lamp shines on it head-on."""
     lobes: Float[Tensor, "S 4"]
     """How well each of `LOBES` mirrors the lamp to the eye."""
 

@@ -204,9 +204,9 @@ class PoseRefinement(nn.Module):
     def penalty(self, steps: Float[Tensor, "M 6"]) -> Float[Tensor, ""]:
         """What large and rough corrections cost; of `free_steps`."""
         bends = [steps[self.get_buffer(f"places_{count}")].diff(n=2, dim=1).flatten() for count in self.lines]
-        bent = torch.cat([steps.new_zeros(0), *bends])
+        second = torch.cat([steps.new_zeros(0), *bends])
         large = steps.square().mean() + self.lens.steps.square().sum()
-        return _SIZE_PENALTY * large + _BEND_PENALTY * bent.square().sum() / max(1, len(bent))
+        return _SIZE_PENALTY * large + _BEND_PENALTY * second.square().sum() / max(1, len(second))
 
     def nearest_knots(self, rays: RayBundle) -> Int[Tensor, " R"]:
         """Of rays as `forward` takes them."""

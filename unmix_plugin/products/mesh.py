@@ -72,7 +72,7 @@ def say_units(job: Job, file: str) -> None:
     """Say what lengths in a glTF file are: metres, as it prescribes, only where the run has a scale."""
     scale = job.loaded.scale
     unknown = "in units of the scene, of unknown size, where glTF has metres: unmix-export scale sets one"
-    job.say(f"lengths in {file} are {unknown if scale is None else f'in metres: {scale.said}'}")
+    job.say(f"lengths in {file} are {unknown if scale is None else f'in metres: {scale.in_words}'}")
 
 
 def find_surface(

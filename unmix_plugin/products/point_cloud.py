@@ -131,9 +131,9 @@ class _PointScore:
     def comments(self, materials: Materials) -> list[str]:
         """What a file says of it, and what its numbers stand for where they are ids."""
         caveat = "" if materials.is_light_known else "; of radiance, since the scene's light is unknown"
-        said = f"{self.property}: {self.output}, {self.map.what}"[:_LONGEST_COMMENT] + caveat
+        comment = f"{self.property}: {self.output}, {self.map.what}"[:_LONGEST_COMMENT] + caveat
         classes = enumerate(self.map.classes)
-        return [said, *(f"{self.property} {index}: {name}" for index, (name, _) in classes)]
+        return [comment, *(f"{self.property} {index}: {name}" for index, (name, _) in classes)]
 
 
 def _require_point_scores(

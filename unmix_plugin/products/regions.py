@@ -61,7 +61,7 @@ def export(job: Job, asked: Regions) -> list[Path]:
     name, region = check_name(asked.add, job.loaded.measures.regions), _requested(job, asked)
     found = measured_surface(job).measure(region, name)
     path = keep_region(job.loaded.folder, name, region)
-    job.say(f"{name}: {found.said(job.materials.names, job.scene.scale)}")
+    job.say(f"{name}: {found.in_words(job.materials.names, job.scene.scale)}")
     return [path]
 
 
@@ -80,7 +80,7 @@ def _measure_all(job: Job) -> list[Path]:
     for name, one in found.items():
         area_cm2 = "" if factor is None else f"{one.area * factor:.6g}"
         rows.append([name, f"{one.area:.6g}", area_cm2, *(f"{share:.6g}" for share in one.abundances)])
-        job.say(f"{name}: {one.said(names, scale)}")
+        job.say(f"{name}: {one.in_words(names, scale)}")
     make_folder(job.folder)
     write_file(table, csv_bytes(rows))
     columns = [f"{name} {what}" for name in found for what in ("mean", "standard deviation")]
@@ -156,7 +156,7 @@ def set_scale(job: Job, asked: scene_products.Scale) -> list[Path]:
         scale = scale_between(first, second, distance_m)
         for point in (first, second):
             require_on_surface(job.loaded.scene, point)
-    job.say(scale.said)
+    job.say(scale.in_words)
     return [keep_scale(job.loaded.folder, scale)]
 
 

@@ -130,7 +130,7 @@ def _region(job: Job, region: str) -> _ProbedPlace:
     job.claim([*_spectrum_paths(job.folder, name), *envi_library_paths(job.folder / name)])
     found = spectrum_at(job.scene, NamedRegion(region, kept, measured_surface(job)))
     assert found.region is not None
-    job.say(f"{region}: {found.region.said(job.materials.names, job.scene.scale)}")
+    job.say(f"{region}: {found.region.in_words(job.materials.names, job.scene.scale)}")
     facts = {"region": region, "area_square_units": found.region.area}
     return _ProbedPlace(name, f"region {region}", facts, found.probe, spread=found.region.spread)
 

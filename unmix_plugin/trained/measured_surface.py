@@ -50,7 +50,7 @@ class MeasuredRegion:
     vertex_areas: Float64[np.ndarray, " V"]
     """Its part of what each vertex stands for, a third of its triangles; square units of the world."""
 
-    def said(self, names: Sequence[str], scale: Scale | None) -> str:
+    def in_words(self, names: Sequence[str], scale: Scale | None) -> str:
         """Area and largest shares for people."""
         largest = np.argsort(-self.abundances)[:3]
         shares = ", ".join(f"{names[index]} {self.abundances[index]:.2f}" for index in largest)

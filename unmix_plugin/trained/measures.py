@@ -49,7 +49,7 @@ class Scale:
             )
 
     @property
-    def said(self) -> str:
+    def in_words(self) -> str:
         """The scale as a line for people and for headers of files."""
         return f"1 unit is {self.metres_per_unit:.6g} m ({self.how})"
 
@@ -74,7 +74,7 @@ class Measures:
 
 def describe_scale(scale: Scale | None) -> str:
     """What headers of exported files say of lengths."""
-    return "lengths are in units of the scene, of unknown size" if scale is None else scale.said
+    return "lengths are in units of the scene, of unknown size" if scale is None else scale.in_words
 
 
 def describe_length(units: float, scale: Scale | None) -> str:
@@ -106,8 +106,8 @@ def describe_area(square_units: float, scale: Scale | None) -> str:
 def recorded_scale(summary: Mapping[str, Any]) -> Scale | None:
     """What the scene of a run said of its world's units; None where it did not, a RunError where that is damaged."""
     try:
-        said = {"metres_per_unit": summary[METRES_KEY], "how": "as the scene's poses say"}
-        return None if said["metres_per_unit"] is None else _scale_from_json(said)
+        stated = {"metres_per_unit": summary[METRES_KEY], "how": "as the scene's poses say"}
+        return None if stated["metres_per_unit"] is None else _scale_from_json(stated)
     except KeyError:
         return None
     except (ConfigError, ValueError) as error:

@@ -208,7 +208,7 @@ class Session:
         self._legend_shown = ""
         self._object_owners: set[str] = set()
         self._notices: dict[str, viser.NotificationHandle] = {}
-        self._warning_said = (-math.inf, "")
+        self._last_warning = (-math.inf, "")
         self._notes: tuple[str, ...] = ()
         self._status = client.gui.add_html(paragraph("waiting for the first picture"))
         self._legend = client.gui.add_html("")
@@ -294,8 +294,8 @@ class Session:
     def warn(self, text: str, title: str = "not done") -> None:
         """Show a warning in place of the one before: a control that is dragged causes many. The same one is shown once
         in 8 s."""
-        before, self._warning_said = self._warning_said, (time.monotonic(), text)
-        if before[1] != text or self._warning_said[0] - before[0] >= _NOTICE_S:
+        before, self._last_warning = self._last_warning, (time.monotonic(), text)
+        if before[1] != text or self._last_warning[0] - before[0] >= _NOTICE_S:
             self.say(title, text, "red", "warning")
 
     def _show_notes(self, notes: tuple[str, ...]) -> None:

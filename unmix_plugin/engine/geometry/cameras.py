@@ -274,9 +274,9 @@ def distort(
     p1, p2 = coefficients[..., 2], coefficients[..., 3]
     r2 = x * x + y * y
     radial, _ = _radial(r2, coefficients)
-    bent_x = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
-    bent_y = y * radial + 2.0 * p2 * x * y + p1 * (r2 + 2.0 * y * y)
-    return torch.stack([bent_x, bent_y], dim=-1)
+    distorted_x = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
+    distorted_y = y * radial + 2.0 * p2 * x * y + p1 * (r2 + 2.0 * y * y)
+    return torch.stack([distorted_x, distorted_y], dim=-1)
 
 
 def _fold_radius(coefficients: Float[Tensor, " D"]) -> float:

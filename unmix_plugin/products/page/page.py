@@ -189,7 +189,7 @@ def _page(job: Job, content: PageContent, known: _KnownSpectra, title: str) -> b
         "made": f"unmix-nerf {__version__}, {datetime.now(timezone.utc):%Y-%m-%d}",
         "arrays": layout,
         "metres_per_unit": None if scale is None else scale.metres_per_unit,
-        "scale": None if scale is None else scale.said,
+        "scale": None if scale is None else scale.in_words,
         **_spectral_facts(content.materials, job.loaded.record.summary.get("illuminant")),
         "known": known.sources,
         "regions": [],

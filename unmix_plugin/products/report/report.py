@@ -63,7 +63,7 @@ def export(job: Job, asked: Report) -> list[Path]:
         raise ConfigError(f"--max-views is {asked.max_views}; choose at least 1")
     job.claim([job.folder / "report.html"])
     known = library_of(asked.library, job.materials.bands, job.scene.light_power)
-    said = _about(job.loaded.folder, asked)
+    about = _about(job.loaded.folder, asked)
     chosen = evenly(job.views("eval"), asked.max_views)
     scene, notes = None, []
     if asked.edits is not None or asked.illuminant is not None:
@@ -84,7 +84,7 @@ def export(job: Job, asked: Report) -> list[Path]:
         scale = job.scene.scale
         regions = [pictures.region_card(name, one, job.materials, scale) for name, one in found.items()]
     with job.working("laying out the report"):
-        values = {**_page(job, views, known, said), "notes": notes, "regions": regions}
+        values = {**_page(job, views, known, about), "notes": notes, "regions": regions}
         page = _render_page(values).encode("utf-8", "backslashreplace")
         return [write_file(job.folder / "report.html", page)]
 
@@ -244,7 +244,7 @@ def _scene_facts(loaded: LoadedRun, materials: Materials, about: Mapping[str, st
         ("Bands", str(materials.bands)),
         ("Light", light if materials.is_light_known else "unknown, taken as flat"),
         ("Box that holds the scene", " x ".join(describe_length(edge, world.scale) for edge in size)),
-        *([("Scale", world.scale.said)] if world.scale is not None else []),
+        *([("Scale", world.scale.in_words)] if world.scale is not None else []),
         ("Training", f"{loaded.training.train_seconds:,.0f} s"),
     ]
 
@@ -267,7 +267,9 @@ def _summary(
     count, known = len(loaded.record.train_cameras), figures or {}
     text = f"{counted(len(cards), 'material')} told apart in {counted(count, 'view')}: {', '.join(named)}."
     words = (("sam", "spectra are off by", " rad"), ("rmse", "values by", " of full scale"))
-    errors = [f"{said} {known[name]:.2g}{unit}" for name, said, unit in words if known.get(name) is not None]
+    errors = [
+        f"{phrase} {known[name]:.2g}{unit}" for name, phrase, unit in words if known.get(name) is not None
+    ]
     if errors:
         text += f" In views that were kept apart from training, {' and '.join(errors)}, on average."
     if views.confidence is not None:

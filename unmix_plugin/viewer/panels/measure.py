@@ -97,4 +97,4 @@ class MeasurePanel:
             require_on_surface(scene, second)
         keep_scale(source.run, scale)
         self._show()
-        self._session.say("scale set", f"{scale.said}; kept with the run")
+        self._session.say("scale set", f"{scale.in_words}; kept with the run")
