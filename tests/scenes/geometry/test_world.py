@@ -45,6 +45,7 @@ def test_a_world_goes_on_where_pixels_or_matched_places_tell_of_more_than_a_clos
     assert not closed.goes_on
     assert not _WorldEvidence(0, 0, 0, 0).goes_on
     assert replace(closed, num_inside=600, num_behind=300).goes_on
+    assert replace(closed, num_inside=900, num_behind=80).goes_on  # walls that few views see, beyond the box
     assert replace(closed, num_inside=300, num_behind=10, num_explained=350).goes_on
     assert "end with its box" in closed.in_words()
     within, beyond = torch.tensor([0.5, -0.9, 1.1]), torch.tensor([0.0, 2.0, 0.0])
