@@ -14,8 +14,10 @@ from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes.demo.scene import make_demo_scene
 from unmix_plugin.scenes.doctor import check_lenses, check_parallax, check_poses
 from unmix_plugin.scenes.geometry.view_agreement import (
+    GIVEN,
     compare_conventions,
     compare_scene_conventions,
+    convention_decision,
 )
 from unmix_plugin.scenes.geometry.views import Views
 from unmix_plugin.scenes.reading.loader import load_scene
@@ -139,3 +141,13 @@ def test_pixels_to_which_no_direction_leads_are_said(k1: float, said: str | None
     found = check_lenses(bent)
     assert (found is not None) == (said is not None)
     assert (said or "") in ("" if found is None else found.sentence())
+
+
+def test_conventions_under_which_views_share_nothing_decide_nothing_and_are_no_evidence():
+    apart = convention_decision({GIVEN: float("inf")})
+    assert apart.is_undecided
+    assert apart.evidence == {}
+    other = "world to camera, OpenGL axes"
+    assert convention_decision({GIVEN: float("inf"), other: 0.1}).evidence == {
+        f"views differ as {other}": 0.1
+    }

@@ -114,7 +114,7 @@ def convention_decision(disagreements: dict[str, float]) -> Decision:
     return Decision(
         "poses",
         UNDECIDED if not is_clear else "fit" if fits or best == GIVEN else f"look like {best}",
-        {f"views differ as {name}": value for name, value in disagreements.items()},
+        {f"views differ as {name}": value for name, value in disagreements.items() if np.isfinite(value)},
         f"the views differ {LEAST_RATIO:g} times less under another convention, and clearly",
     )
 
