@@ -187,19 +187,21 @@ def finish(trainer: Trainer, console: Console) -> None:
     data = trainer.pipeline.datamanager
     scene = spectral_scene(data)
     if scene is not None:  # remarks name settings of spectral methods
-        _compare_views(trainer, scene, console)
+        _compare_views(trainer, scene, console, record.steps)
         num_pixels = int(data.metadata().get("num_train_pixels", 0))
         few = remark_on_passes(record.total_rays, num_pixels)
         for remark in [*remarks_on_course(trainer.run.metrics_path), *few]:
             say(console, remark)
 
 
-def _compare_views(trainer: Trainer, scene: Scene, console: Console) -> None:
-    """Say, here and in run.log, which training views do not fit the others."""
+def _compare_views(trainer: Trainer, scene: Scene, console: Console, steps: int) -> None:
+    """Say, here and in run.log, which training views do not fit the others, and keep how far the scene is off."""
     from unmix_plugin.commands.reporting import say, working
     from unmix_plugin.engine.runs.load_run import read_scene_record
     from unmix_plugin.engine.training.progress import write_event
+    from unmix_plugin.trained.measured_errors import measure_errors, write_errors
     from unmix_plugin.trained.open_run import mixture_scene
+    from unmix_plugin.trained.places import MeasuredScene
     from unmix_plugin.trained.view_fit import describe_misfits, fit_views, write_fits
 
     averages = None if trainer.average is None else trainer.average.values
@@ -209,6 +211,8 @@ def _compare_views(trainer: Trainer, scene: Scene, console: Console) -> None:
         if trained is None:
             return
         found = write_fits(trainer.run.path, fit_views(trained, scene))
+        measured = MeasuredScene(scene, record.summary.get("illuminant"))
+        write_errors(trainer.run.path, measure_errors(trained, measured), steps)
     for remark in describe_misfits(found):
         say(console, f"warning: {remark}")
         write_event(trainer.run, remark)

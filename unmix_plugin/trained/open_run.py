@@ -24,6 +24,7 @@ from unmix_plugin.model import UnmixModel
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.scenes.scene import Scene, scene_identity
 from unmix_plugin.settings import SceneOptions
+from unmix_plugin.trained.measured_errors import read_errors
 from unmix_plugin.trained.measures import Measures, Scale, read_measures, recorded_scale
 from unmix_plugin.trained.model_scene import frozen_parameters, model_scene
 from unmix_plugin.trained.places import MeasuredScene
@@ -146,7 +147,12 @@ def load_run(path: str | Path, device: str = "auto") -> LoadedRun:
     run = LoadedRun(
         loaded.run, loaded.config, loaded.scene, loaded.training, scene, read_measures(loaded.run)
     )
-    return replace(run, scene=replace(scene, scale=run.scale)) if isinstance(scene, TrainedScene) else run
+    if not isinstance(scene, TrainedScene):
+        return run
+    shape = (len(scene.bands), len(scene.materials.names))
+    errors = read_errors(loaded.run.path, loaded.training.steps, *shape)
+    errors = errors if isinstance(errors, str) else errors.map(lambda values: values.to(scene.device))
+    return replace(run, scene=replace(scene, scale=run.scale, measured_errors=errors))
 
 
 def open_run(path: str | Path, device: str = "auto") -> TrainedScene:

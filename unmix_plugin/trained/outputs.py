@@ -28,9 +28,11 @@ from unmix_plugin.spectral.colour.conversion import (
     rgb_matrix,
 )
 from unmix_plugin.spectral.features import FEWEST_BANDS, continuum_removed, derivative_matrix
+from unmix_plugin.spectral.intervals import COVERAGE
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Coefficients, Materials
 from unmix_plugin.spectral.segmentation import NOTHING_ID, material_scores
 from unmix_plugin.spectral.subspace import PcaColours
+from unmix_plugin.trained.intervals import SeenPlaces, no_interval, reflectance_number
 from unmix_plugin.trained.protocol import RenderedView
 from unmix_plugin.trained.reflectance_maps import ReflectanceMap, Score, parse_reflectance_map
 from unmix_plugin.trained.run_materials import endmember_colours
@@ -80,6 +82,11 @@ class MixtureView(ABC):
     @abstractmethod
     def has_removed(self) -> bool:
         """Whether the scene is shown without some of its materials."""
+
+    @property
+    @abstractmethod
+    def seen_places(self) -> SeenPlaces:
+        """What is seen in each pixel, and how far it is expected to be off; a ConfigError where that is unknown."""
 
     @abstractmethod
     def map(self, function: Callable[[Tensor], Tensor]) -> MixtureView:
@@ -551,14 +558,20 @@ def _scored(view: MixtureView, score: Score) -> Tensor:
     return torch.cat([score(view.materials.reflectance(chunk)) for chunk in chunks]).view(view.opacity.shape)
 
 
-def _abundance(name: str, argument: str, materials: Materials) -> MaterialOutput:
+def _endmember(name: str, materials: Materials) -> int:
+    """Number of the endmember that an output such as `abundance:leaf` names."""
+    argument = name.partition(":")[2]
     number = int(argument) if argument.isdecimal() and argument not in materials.names else -1
     if argument not in materials.names and not 0 <= number < len(materials.names):
         hint = did_you_mean(argument, materials.names, likeness=0.5, form=" ({})")
         raise ConfigError(
             f"{name}: there is no endmember {argument!r}{hint}; known are {', '.join(materials.names)}"
         )
-    index = materials.names.index(argument) if argument in materials.names else number
+    return materials.names.index(argument) if argument in materials.names else number
+
+
+def _abundance(name: str, _: str, materials: Materials) -> MaterialOutput:
+    index = _endmember(name, materials)
     return MaterialOutput(
         name,
         "map",
@@ -567,6 +580,75 @@ def _abundance(name: str, argument: str, materials: Materials) -> MaterialOutput
         _UNIT,
         is_premultiplied=True,
         compute=lambda view: view.coefficients.abundances[..., index],
+    )
+
+
+Ends: TypeAlias = Callable[[SeenPlaces, float], tuple[Tensor, Tensor]]
+"""From what is seen at places, and a coverage, to the low and high ends of intervals."""
+
+
+def interval_ends(name: str, materials: Materials) -> Ends:
+    """Intervals of an output by its name; errors are those of `find_output`, and a ConfigError where it has none."""
+    if name == "abundances":
+        return SeenPlaces.of_abundances
+    if name == "spectral":
+        return SeenPlaces.of_spectra
+    output, prefix = find_output(name, materials), name.partition(":")[0]
+    if prefix == "abundance":
+        index = _endmember(name, materials)
+
+        def of_one(seen: SeenPlaces, coverage: float) -> tuple[Tensor, Tensor]:
+            low, high = seen.of_abundances(coverage)
+            return low[..., index], high[..., index]
+
+        return of_one
+    if prefix == "band":
+        band = materials.bands.nearest(_wavelength_nm(name.partition(":")[2], name))
+
+        def of_band(seen: SeenPlaces, coverage: float) -> tuple[Tensor, Tensor]:
+            low, high = seen.of_spectra(coverage)
+            return low[..., band], high[..., band]
+
+        return of_band
+    if name == "reflectance":
+        number = reflectance_number(materials)
+    elif output.score is not None and output.score.is_local and output.kind == "map":
+        number = reflectance_number(materials, output.score.fit(torch.empty(0, len(materials.bands))))
+    else:
+        raise no_interval(name)
+    return lambda seen, coverage: seen.of_number(number, coverage)
+
+
+def _interval(name: str, argument: str, materials: Materials) -> MaterialOutput:
+    """Width of the interval of an output of one number a pixel; of `abundance`, that of the largest one."""
+    about = f"width of the {COVERAGE:.0%} interval"
+    if argument == "abundance":
+        what = "largest abundance"
+
+        def width(view: MixtureView) -> Tensor:
+            low, high = view.seen_places.of_abundances()
+            largest = view.coefficients.abundances.argmax(dim=-1, keepdim=True)
+            return (high - low).gather(-1, largest)[..., 0]
+
+    else:
+        one = find_output(argument, materials)
+        if one.kind not in ("map", "grey"):
+            raise no_interval(argument)
+        ends, what = interval_ends(argument, materials), one.label
+
+        def width(view: MixtureView) -> Tensor:
+            low, high = ends(view.seen_places, COVERAGE)
+            return high - low
+
+    is_abundance = argument.partition(":")[0] == "abundance"
+    return MaterialOutput(
+        name,
+        "map",
+        FAMILIES["interval"].title,
+        f"{about}, {what}",
+        (0.0, 0.5) if is_abundance else None,
+        remarks=("NaN where not determined",),
+        compute=width,
     )
 
 
@@ -594,6 +676,7 @@ FAMILIES: dict[str, _Family] = {
     "target": _Family("map", "likeness to a target", "to know which", "target:paint.csv", _reflectance_map),
     "library": _Family("labels", "nearest of a library", "a file", "library:mine.csv<0.1", _reflectance_map),
     "absorption": _Family("map", "absorption", "wavelengths", "absorption:650-700", _reflectance_map),
+    "interval": _Family("map", "width of the interval", "an output", "interval:abundance", _interval),
 }
 """By the part of the name before the colon."""
 

@@ -7,7 +7,7 @@ unmix-nerf; `model_scene.ModelScene` serves any model that names its outputs.
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -18,9 +18,13 @@ from torch import Tensor
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.engine.outputs import Output
+from unmix_plugin.errors import ConfigError
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.materials import Materials
+from unmix_plugin.spectral.intervals import COVERAGE, Interval, require_coverage
+from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Materials
+from unmix_plugin.trained.intervals import SeenPlaces, as_interval
+from unmix_plugin.trained.place_errors import LocalErrors
 from unmix_plugin.trained.run_views import RunView
 
 
@@ -37,6 +41,8 @@ class Probe:
     """Of the surface in the pixel, or the point, model space; None where nothing is."""
     world_position: Float64[np.ndarray, "3"] | None
     """The same in the world of the scene's transforms.json."""
+    errors: LocalErrors | str = "the method measures no errors"
+    """How far it is expected to be off, or why that is unknown, for people."""
 
     @property
     def spectra(self) -> dict[str, Float64[np.ndarray, " B"]]:
@@ -48,6 +54,32 @@ class Probe:
     def abundances(self) -> Float64[np.ndarray, " K"]:
         """Of what is there, summing to 1; 0 where nothing is."""
         return self.values["abundances"]
+
+    def interval(
+        self, name: Literal["abundances", "predicted"] = "abundances", coverage: float = COVERAGE
+    ) -> Interval:
+        """Where each abundance lies, or the radiance of each band, with this probability; where that is unknown, the
+        interval says why. A ConfigError where there is none of that name or coverage."""
+        require_coverage(coverage)
+        if name not in ("abundances", "predicted"):
+            raise ConfigError(f"a probe has intervals of abundances and predicted; found {name!r}")
+        values, errors = self.values[name], self.errors
+        if isinstance(errors, str) or self.opacity < OCCUPIED_ACCUMULATION:
+            reason = errors if isinstance(errors, str) else "hardly anything is there"
+            return Interval.unknown(values, coverage, reason)
+        seen = seen_place(self, errors)
+        ends = seen.of_abundances(coverage) if name == "abundances" else seen.of_spectra(coverage)
+        found = as_interval(ends, errors, coverage)
+        if name == "abundances":
+            return found
+        return replace(found, low=found.low * self.opacity, high=found.high * self.opacity)
+
+
+def seen_place(probe: Probe, errors: LocalErrors) -> SeenPlaces:
+    """What a probe shows, as intervals are made of it."""
+    spectrum = torch.from_numpy(probe.values["predicted"] / max(probe.opacity, 1e-6)).to(errors.spectra)
+    abundances = torch.from_numpy(probe.values["abundances"]).to(errors.spectra)
+    return SeenPlaces(spectrum, abundances, torch.tensor(probe.opacity).to(errors.spectra), errors)
 
 
 @runtime_checkable

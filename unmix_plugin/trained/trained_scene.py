@@ -27,7 +27,9 @@ from unmix_plugin.rendering.front_to_back import composite_view
 from unmix_plugin.rendering.renderer import VolumeRenderer
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.materials import Coefficients, Materials
+from unmix_plugin.spectral.intervals import COVERAGE, Interval, require_coverage
+from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Coefficients, Materials
+from unmix_plugin.trained.intervals import SeenPlaces, as_interval
 from unmix_plugin.trained.measures import Scale
 from unmix_plugin.trained.outputs import (
     MaterialOutput,
@@ -35,8 +37,10 @@ from unmix_plugin.trained.outputs import (
     available_outputs,
     components_of,
     find_output,
+    interval_ends,
 )
-from unmix_plugin.trained.protocol import Probe, RenderedView
+from unmix_plugin.trained.place_errors import LocalErrors, PlaceErrors
+from unmix_plugin.trained.protocol import Probe, RenderedView, seen_place
 from unmix_plugin.trained.run_views import RunView, cameras_of
 
 
@@ -107,6 +111,16 @@ class MaterialView(MixtureView):
     def has_removed(self) -> bool:
         """Whether the scene is shown without some of its materials."""
         return self.scene.has_removed
+
+    @property
+    def seen_places(self) -> SeenPlaces:
+        """What is seen in each pixel, and how far it is expected to be off; a ConfigError where that is unknown."""
+        errors, seen = self.scene.known_errors, self.coefficients
+        rays = self.camera.to(errors.origin.device).image_rays(0)
+        positions = rays.origins + seen.ray_distance.flatten()[:, None].to(rays.origins) * rays.directions
+        local = errors.at(positions.view(*self.opacity.shape, 3)).to(self.opacity.device)
+        opaque = self.opacity.clamp(min=1e-6)[..., None]
+        return SeenPlaces(self.spectra / opaque, seen.abundances / opaque, self.opacity, local)
 
     def map(self, function: Callable[[Tensor], Tensor]) -> MaterialView:
         """The same view with its coefficients on another device, or of some rows."""
@@ -180,6 +194,23 @@ class TrainedScene:
     """How long a unit of its world is; None where that is unknown."""
     view_gains: Float[Tensor, "V B"] | None = None
     """What is rendered, times this, is as bright as each training view measured it; on the CPU. None: 1."""
+    measured_errors: PlaceErrors | str = "errors are measured when a training ends"
+    """How far it was from what its training views measured, as it was trained; or why that is unknown, for people."""
+
+    @property
+    def errors(self) -> PlaceErrors | str:
+        """How far it is expected to be off, or why that is unknown, for people."""
+        if self.unedited is not None:
+            return "the scene is edited, and errors are known of it only as it was trained"
+        return self.measured_errors
+
+    @property
+    def known_errors(self) -> PlaceErrors:
+        """The same; a ConfigError where it is unknown."""
+        errors = self.errors
+        if isinstance(errors, str):
+            raise ConfigError(f"intervals are not determined: {errors}")
+        return errors
 
     @property
     def as_trained(self) -> TrainedScene:
@@ -223,8 +254,12 @@ class TrainedScene:
         return replace(self, renderer=replace(self.renderer, opaque_skips=None))
 
     def output(self, name: str) -> MaterialOutput:
-        """An output by its name, such as `rgb`, `band:650nm` or `index:ndvi`; errors as those of `find_output`."""
-        return find_output(name, self.materials)
+        """An output by its name, such as `rgb`, `band:650nm` or `index:ndvi`; errors as those of `find_output`, and a
+        ConfigError where intervals are asked for and not determined."""
+        found = find_output(name, self.materials)
+        if name.startswith("interval:"):
+            _ = self.known_errors
+        return found
 
     def look(self, camera: Cameras, subpixels: int | None = None) -> MaterialView:
         """Render a view; `subpixels` squared rays a pixel, None for as many as in training."""
@@ -260,7 +295,30 @@ class TrainedScene:
             opacity,
             place,
             None if place is None else self.frame.to_world(place[None])[0],
+            self.errors_at(place),
         )
+
+    def errors_at(self, position: Float64[np.ndarray, "3"] | None) -> LocalErrors | str:
+        """How far it is expected to be off at a place of model space, or why that is unknown, for people."""
+        errors = self.errors
+        if isinstance(errors, str) or position is None:
+            return errors if isinstance(errors, str) else "nothing is there"
+        return errors.at(torch.from_numpy(position).to(errors.origin))
+
+    def interval(self, probe: Probe, name: str, coverage: float = COVERAGE) -> Interval:
+        """Where an output at a place lies, with this probability; where that is unknown, the interval says why.
+
+        Outputs are `abundances`, `abundance:0`, `spectral`, `band:650nm`, `reflectance`, and numbers of reflectance
+        such as `index:ndvi`; of light, it is that of what is seen, as if it were opaque.
+
+        Errors are those of `output`, and a ConfigError where the output has no intervals.
+        """
+        require_coverage(coverage)
+        ends = interval_ends(name, self.materials)
+        if isinstance(probe.errors, str) or probe.opacity < OCCUPIED_ACCUMULATION:
+            reason = probe.errors if isinstance(probe.errors, str) else "hardly anything is there"
+            return Interval.unknown(np.zeros(()), coverage, reason)
+        return as_interval(ends(seen_place(probe, probe.errors), coverage), probe.errors, coverage)
 
     @torch.no_grad()
     def probe_point(self, x: float, y: float, z: float) -> Probe:
@@ -292,6 +350,7 @@ class TrainedScene:
             float(is_there * -torch.expm1(-density * self.pixel_size)),
             place,
             world,
+            self.errors_at(place),
         )
 
     def to(self, device: torch.device | str) -> TrainedScene:
@@ -302,9 +361,14 @@ class TrainedScene:
             with_cells(self.renderer, lambda cells: cells.to(device)), box=self.scene_box.to(device)
         )
         field = copy.deepcopy(self.field).to(device)
-        unedited = None if self.unedited is None else self.unedited.to(device)
+        unedited, errors = None if self.unedited is None else self.unedited.to(device), self.measured_errors
         return replace(
-            self, field=field, renderer=renderer, materials=self.materials.to(device), unedited=unedited
+            self,
+            field=field,
+            renderer=renderer,
+            materials=self.materials.to(device),
+            unedited=unedited,
+            measured_errors=errors if isinstance(errors, str) else errors.map(lambda one: one.to(device)),
         )
 
 

@@ -29,9 +29,10 @@ class RenderOptions(Look, SharedViews, WriteOptions, EditOptions, RunOptions):
     specular_rgb, abundances, abundance:NAME, material_scores, probe_probabilities, segmentation, confidence, depth,
     ray_distance, normals, accumulation, pca, band:650nm, false-colour:860,650,550; index:ndvi or
     index:(r800-r670)/(r800+r670), target:paint.csv or target:ace:paint.csv>0.5, library:mine.csv<0.1 or
-    library:angle:mine.csv, absorption:650-700 (depth; or absorption:centre:650-700, absorption:area:650-700); or all
-    (but those with a colon). None given: spectral rgb abundances segmentation depth for single views, rgb for a
-    path."""
+    library:angle:mine.csv, absorption:650-700 (depth; or absorption:centre:650-700, absorption:area:650-700),
+    interval:abundance, interval:abundance:NAME, interval:band:650nm or interval:index:ndvi (width of the 90 %
+    interval); or all (but those with a colon). None given: spectral rgb abundances segmentation depth for single
+    views, rgb for a path."""
     formats: tuple[str, ...] = ()
     """envi, exr, npy, png, mp4, tif (GeoTIFF of maps); each output is written in those that suit it. None given:
     what suits each best. mp4 of spectra goes through the bands."""

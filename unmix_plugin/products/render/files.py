@@ -108,7 +108,8 @@ def file_name(output: Output) -> str:
     has_file = output.name.startswith(("target:", "library:"))
     short = re.sub(r"[^:]*[/\\]", "", output.name) if has_file else output.name
     plain = re.sub(r"[^\w.+-]+", "-", short).strip("-.")
-    is_formula = output.name.startswith("index:") and output.name.removeprefix("index:") not in NAMED_INDICES
+    shown = output.name.removeprefix("interval:")
+    is_formula = shown.startswith("index:") and shown.removeprefix("index:") not in NAMED_INDICES
     ending = f"-{hashlib.sha256(output.name.encode()).hexdigest()[:8]}" if is_formula else ""
     return safe_name(plain + ending)
 

@@ -1,0 +1,206 @@
+"""Intervals of what a scene shows: as many hold what is true as they say, and where nothing is known they say so."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+
+from tests.method_factory import NUM_BANDS
+from tests.products.ball_model import RADIUS, ball_scene
+from tests.trained.camera_scenes import FRAME
+from unmix_plugin.editing import Light, Recipe, edit_scene
+from unmix_plugin.errors import ConfigError, RunError
+from unmix_plugin.scenes.demo.scene import make_demo_scene
+from unmix_plugin.scenes.reading.loader import load_scene
+from unmix_plugin.spectral.intervals import width_factor
+from unmix_plugin.trained.measured_errors import FILE_NAME, measure_errors, read_errors, write_errors
+from unmix_plugin.trained.place_errors import CELL_SIZES_PX, PixelErrors, PlaceErrors
+from unmix_plugin.trained.places import MeasuredScene
+from unmix_plugin.trained.run_views import RunView
+
+PIXEL = 0.01
+VIEWS = 12
+
+
+def places(count, generator):
+    """On a square of 60 pixels; errors are four times as large on one half."""
+    positions = torch.rand(count, 3, generator=generator) * torch.tensor([60 * PIXEL, 60 * PIXEL, 0.0])
+    deviations = torch.where(positions[:, 0] < 30 * PIXEL, 0.02, 0.08)
+    return positions, deviations
+
+
+def pixel_errors(positions, deviations, generator, common=0.0):
+    """Errors with heavy tails, part of them the same everywhere."""
+
+    def draw(width):
+        own = torch.randn(len(positions), width, generator=generator)
+        own = own * (1 + 2 * (torch.rand(len(positions), 1, generator=generator) > 0.9))
+        return deviations[:, None] * (own + common)
+
+    abundances = draw(3)
+    return PixelErrors(
+        positions,
+        torch.randint(0, VIEWS, (len(positions),), generator=generator),
+        draw(NUM_BANDS),
+        (abundances,),
+        (torch.ones_like(abundances),),
+    )
+
+
+def fitted(common=0.0, count=20_000, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    errors = PlaceErrors.fit(
+        pixel_errors(*places(count, generator), generator, common), torch.zeros(3), PIXEL
+    )
+    assert errors is not None
+    return errors
+
+
+@pytest.mark.parametrize("coverage", [0.5, 0.8, 0.9, 0.95])
+def test_of_errors_that_were_not_seen_as_many_are_within_as_the_coverage_says(coverage):
+    errors, generator = fitted(), torch.Generator().manual_seed(7)
+    positions, deviations = places(5000, generator)
+    fresh, local = pixel_errors(positions, deviations, generator), errors.at(positions)
+    is_large = deviations > 0.05
+    half = width_factor(errors.abundance_factors, coverage) * local.abundances
+    of_spectra = (
+        width_factor(errors.spectrum_factors, coverage) * local.spectra[:, None] * errors.band_deviations
+    )
+    for within in (fresh.abundances[0].abs() <= half, fresh.spectra.abs() <= of_spectra):
+        for part in (is_large, ~is_large):
+            assert float(within[part].double().mean()) == pytest.approx(coverage, abs=0.03)
+    assert float(half[is_large].mean() / half[~is_large].mean()) == pytest.approx(4, rel=0.15)
+
+
+def test_what_is_the_same_everywhere_stays_in_the_mean_of_a_region_and_the_rest_does_not():
+    generator = torch.Generator().manual_seed(3)
+    positions, _ = places(500, generator)
+    weights = np.ones(500)
+    edge = 48 * PIXEL
+    own = fitted(0.0).over_region(positions, weights, edge)
+    shared = fitted(2.0).over_region(positions, weights, edge)
+    alone = fitted(2.0).at(positions)
+    assert float(own.abundances.max()) < 0.2 * float(alone.abundances.mean())
+    assert float(shared.abundances.min()) > 0.6 * float(alone.abundances.square().mean().sqrt())
+
+
+def test_where_fewer_than_two_views_measured_errors_are_unknown():
+    errors = fitted()
+    away = torch.tensor(
+        [[30 * PIXEL, 30 * PIXEL, 0.0], [30 * PIXEL, 30 * PIXEL, 5 * CELL_SIZES_PX[0] * PIXEL]]
+    )
+    local = errors.at(away)
+    assert local.spectra.isfinite().tolist() == [True, False]
+    assert local.abundances.isfinite().all(dim=1).tolist() == [True, False]
+    nowhere = errors.over_region(away[1:], np.ones(1), PIXEL)
+    assert nowhere.spectra.isnan().all()
+
+
+def test_of_two_views_nothing_is_said():
+    generator = torch.Generator().manual_seed(0)
+    found = pixel_errors(*places(2000, generator), generator)
+    few = replace(found, views=found.views % 2)
+    assert PlaceErrors.fit(few, torch.zeros(3), PIXEL) is None
+
+
+def test_a_run_keeps_its_errors_and_says_why_there_are_none(tmp_path):
+    errors = fitted(count=2000)
+    assert "no errors.safetensors" in str(read_errors(tmp_path, 10, NUM_BANDS, 3))
+    write_errors(tmp_path, errors, 10)
+    again = read_errors(tmp_path, 10, NUM_BANDS, 3)
+    assert isinstance(again, PlaceErrors)
+    torch.testing.assert_close(again.tensors(), errors.tensors())
+    assert "after 10 steps, and the run has 20" in str(read_errors(tmp_path, 20, NUM_BANDS, 3))
+    with pytest.raises(RunError, match="another number of bands"):
+        read_errors(tmp_path, 10, NUM_BANDS + 1, 3)
+    write_errors(tmp_path, None, 10)
+    assert not (tmp_path / FILE_NAME).exists()
+
+
+def test_a_damaged_file_of_errors_is_refused(tmp_path):
+    write_errors(tmp_path, fitted(count=2000), 10)
+    data = (tmp_path / FILE_NAME).read_bytes()
+    (tmp_path / FILE_NAME).write_bytes(data[: len(data) // 2])
+    with pytest.raises(RunError, match="is damaged"):
+        read_errors(tmp_path, 10, NUM_BANDS, 3)
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory):
+    """A ball beside the views of another scene, so that it is far off."""
+    folder = tmp_path_factory.mktemp("scene") / "demo"
+    make_demo_scene(folder, 40, NUM_BANDS, 12)
+    scene = load_scene(folder)
+    split = {**dict.fromkeys(scene.train_indices, "train"), **dict.fromkeys(scene.eval_indices, "eval")}
+    views = tuple(RunView(scene.frames[i].name, scene.cameras[i], which) for i, which in split.items())  # type: ignore[arg-type]
+    ball = replace(ball_scene(), views=views, frame=FRAME)
+    errors = measure_errors(ball, MeasuredScene(scene, None))
+    assert errors is not None
+    return replace(ball, measured_errors=errors)
+
+
+def middle(scene):
+    camera = scene.views[-1].camera
+    return camera, camera.width // 2, camera.height // 2
+
+
+def test_a_probe_has_the_interval_that_the_map_shows(measured):
+    camera, column, row = middle(measured)
+    probe, view = measured.probe(camera, column, row), measured.look(camera)
+    found = probe.interval("abundances")
+    assert found.not_determined == ""
+    largest = int(probe.abundances.argmax())
+    assert found.low[largest] <= probe.abundances[largest] <= found.high[largest]
+    assert found.low.min() >= 0
+    assert found.high.max() <= 1
+    for name in ("abundance:0", "abundance:1", "band:500nm"):
+        own = measured.interval(probe, name)
+        np.testing.assert_allclose(view[f"interval:{name}"][row, column], own.width, rtol=1e-3, atol=1e-5)
+    np.testing.assert_allclose(view["interval:abundance"][row, column], found.width[largest], rtol=1e-3)
+    assert view["interval:abundance"][0, 0].isnan()  # nothing is there
+
+
+def test_wider_intervals_hold_narrower_ones_and_spectra_are_not_negative(measured):
+    probe = measured.probe(*middle(measured))
+    for name in ("abundances", "predicted"):
+        ends = [probe.interval(name, coverage) for coverage in (0.5, 0.9, 0.99)]
+        for inner, outer in pairwise(ends):
+            assert (outer.low <= inner.low).all()
+            assert (outer.high >= inner.high).all()
+        assert ends[-1].low.min() >= 0
+
+
+def test_the_interval_of_an_index_follows_from_that_of_spectra(measured):
+    probe = measured.probe(*middle(measured))
+    index, band = measured.interval(probe, "index:r500"), measured.interval(probe, "band:500nm")
+    assert index.low == pytest.approx(probe.values["predicted"][1] - index.width / 2)
+    assert index.high == pytest.approx(band.high, rel=1e-3)
+    assert band.low == max(index.low, 0)
+    ratio = measured.interval(probe, "index:r500/r500")
+    assert (ratio.low, ratio.high) == pytest.approx((1, 1))
+
+
+def test_where_there_is_no_honest_interval_it_says_why(measured):
+    camera, column, row = middle(measured)
+    probe = measured.probe(camera, 0, 0)
+    assert "there" in probe.interval().not_determined
+    edited = edit_scene(measured, Recipe(illuminant=Light("A")))
+    assert "edited" in edited.probe(camera, column, row).interval().not_determined
+    with pytest.raises(ConfigError, match="not determined: the scene is edited"):
+        edited.look(camera)["interval:abundance"]
+    untold = replace(measured, measured_errors="nobody looked")
+    assert untold.probe(camera, column, row).interval().not_determined == "nobody looked"
+    point = measured.frame.to_world(RADIUS * np.array([0.0, 0.0, -1.0])).tolist()
+    below = measured.probe_point(*point).interval()
+    assert "fewer than two training views" in below.not_determined
+    assert np.isnan(below.width).all()
+
+
+@pytest.mark.parametrize(
+    "name", ["interval:rgb", "interval:segmentation", "interval:depth", "interval:accumulation"]
+)
+def test_what_has_no_interval_is_refused(measured, name):
+    with pytest.raises(ConfigError, match="no interval of"):
+        measured.output(name)

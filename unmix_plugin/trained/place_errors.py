@@ -1,0 +1,280 @@
+"""How far a scene is off at each place of it, by what its training views measured there.
+
+The surface is divided into cells, small ones within large ones. Of each cell the mean squared difference of what is
+rendered and what was measured is known: of spectra, and of abundances, which are compared with those that measured
+spectra have by themselves. Where a small cell has few pixels, the large one around it speaks for it, and the whole
+scene for that. How wide intervals have to be follows from leaving views out: the errors of each view are put beside
+what the cells say without that view.
+
+docs/background/uncertainty.md says what intervals cover and what they do not.
+
+Notation: `N` measured pixels, `P` places, `B` bands, `K` endmembers, `Q = K + 1` quantities (abundances, and spectra as
+a whole), `C` cells, `D` directions of errors, `L` coverages, `G` sizes of regions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float64, Int64
+from torch import Tensor
+
+from unmix_plugin.spectral.intervals import width_factors
+
+CELL_SIZES_PX = (12.0, 3.0)
+"""Edges of cells, in pixels as large as they are in the middle of the scene."""
+_REGION_SIZES_PX = (3.0, 12.0, 48.0, 192.0)
+"""Edges of regions over which it is known how much of the errors is left in their mean."""
+_PRIOR_PIXELS = 4.0
+"""Pixels of a cell that say as much as the larger one around it."""
+_FEWEST_VIEWS = 2
+"""That have to have measured in a large cell."""
+_DIRECTIONS = 8
+"""Of the errors of spectra, that are kept: those of the largest deviations."""
+_LEAST_SQUARE = 1e-7
+"""Added to mean squares: rounding of what was measured."""
+_INDEX_BITS = 20
+_PRESENT = 0.01
+"""An abundance or what it is compared with has to be as large to decide how wide intervals are: an absent material is
+found to be absent, which says nothing of those that are there."""
+
+
+@dataclass(frozen=True)
+class PixelErrors:
+    """What is rendered of measured pixels less what was measured."""
+
+    positions: Float[Tensor, "N 3"]
+    """Where the pixels' rays end, model space."""
+    views: Int64[Tensor, "N"]
+    """Which view measured."""
+    spectra: Float[Tensor, "N B"]
+    abundances: tuple[Float[Tensor, "N K"], ...]
+    """Against abundances of the measured spectra, by each way to unmix them."""
+    is_present: tuple[Float[Tensor, "N K"], ...]
+    """The larger of each pair of abundances."""
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Sums over the cells of one size."""
+
+    keys: Int64[Tensor, "C"]
+    """Increasing."""
+    counts: Float[Tensor, "C"]
+    """Pixels measured."""
+    views: Int64[Tensor, "C"]
+    """Views that measured any of them."""
+    sums: Float[Tensor, "C Q"]
+    """Of squared errors."""
+
+    def find(self, keys: Int64[Tensor, "P"]) -> tuple[Int64[Tensor, "P"], Bool[Tensor, "P"]]:
+        """Row of each cell, and whether it is there."""
+        rows = torch.searchsorted(self.keys, keys).clamp(max=len(self.keys) - 1)
+        return rows, self.keys[rows] == keys
+
+
+@dataclass(frozen=True)
+class LocalErrors:
+    """Expected errors at some places."""
+
+    abundances: Float[Tensor, "*places K"]
+    """Standard deviation, NaN where too few views measured."""
+    spectra: Float[Tensor, "*places"]
+    """The same of spectra, in multiples of the usual one; NaN as above."""
+    scene: PlaceErrors
+    """Whose errors they are."""
+
+    def to(self, device: torch.device | str) -> LocalErrors:
+        """The same on another device."""
+        scene = self.scene.map(lambda values: values.to(device))
+        return LocalErrors(self.abundances.to(device), self.spectra.to(device), scene)
+
+
+@dataclass(frozen=True)
+class PlaceErrors:
+    """Expected errors at all places of a scene, on one device."""
+
+    origin: Float[Tensor, "3"]
+    """Corner of the cells, model space."""
+    pixel_size: Float[Tensor, ""]
+    """Model units."""
+    large: Cells
+    small: Cells
+    usual: Float[Tensor, "Q"]
+    """Mean squared errors of the whole scene; of spectra 1, in units of the usual one."""
+    directions: Float[Tensor, "D B"]
+    """Of errors of spectra: their usual covariance is directions^T directions."""
+    band_deviations: Float[Tensor, "B"]
+    """Usual root mean squared error of each band, radiance."""
+    abundance_factors: Float[Tensor, "L"]
+    """Half widths of intervals in multiples of the deviation, for each of COVERAGES."""
+    spectrum_factors: Float[Tensor, "L"]
+    abundance_alike: Float[Tensor, "G"]
+    """Share of squared errors that is left in the mean over a region, for each size."""
+    spectrum_alike: Float[Tensor, "G"]
+
+    @staticmethod
+    def fit(errors: PixelErrors, origin: Float[Tensor, "3"], pixel_size: float) -> PlaceErrors | None:
+        """What errors of pixels tell; None where fewer than three views measured any."""
+        if len(errors.views.unique()) <= _FEWEST_VIEWS:
+            return None
+        spectra = errors.spectra.double()
+        band_squares = spectra.square().mean(dim=0) + _LEAST_SQUARE
+        of_spectra = (spectra.square() / band_squares).mean(dim=1, keepdim=True)
+        of_abundances = torch.stack([one.double().square() for one in errors.abundances]).mean(dim=0)
+        squares = torch.cat([of_abundances, of_spectra], dim=1)
+        usual = squares.mean(dim=0)
+
+        keys = [_keys(errors.positions, origin, size * pixel_size) for size in CELL_SIZES_PX]
+        large, small = (_cells(own, errors.views, squares) for own in keys)
+        deviations = _without_own_view(keys, errors.views, squares, usual)
+        of_places, of_spectrum = deviations[:, :-1], deviations[:, -1:] * band_squares.sqrt()
+        present = torch.stack(errors.is_present) > _PRESENT
+        ratios = torch.stack([one.double().abs() / of_places for one in errors.abundances])
+        generator = torch.Generator().manual_seed(0)
+        eigen = torch.linalg.eigh(spectra.T @ spectra / len(spectra))
+        kept = slice(-min(_DIRECTIONS, spectra.shape[1]), None)
+        directions = (eigen.eigenvectors[:, kept] * eigen.eigenvalues[kept].clamp(min=0).sqrt()).T
+        sizes = [_keys(errors.positions, origin, size * pixel_size) for size in _REGION_SIZES_PX]
+        mean_error = torch.stack([one.double() for one in errors.abundances]).mean(dim=0)
+        found = PlaceErrors(
+            origin.double(),
+            torch.tensor(pixel_size, dtype=torch.float64),
+            large,
+            small,
+            usual,
+            directions,
+            band_squares.sqrt(),
+            width_factors(ratios[present] if present.any() else ratios.flatten(), generator),
+            width_factors((spectra.abs() / of_spectrum).flatten(), generator),
+            torch.stack([_alike(one, mean_error) for one in sizes]),
+            torch.stack([_alike(one, spectra) for one in sizes]),
+        )
+        return found.map(lambda values: values.float() if values.is_floating_point() else values)
+
+    def at(self, positions: Float[Tensor, "*places 3"]) -> LocalErrors:
+        """At places of model space; unknown (NaN) where fewer than two views measured around."""
+        flat = positions.reshape(-1, 3).to(self.origin)
+        squares = self.usual.expand(len(flat), -1)
+        is_known = torch.zeros(len(flat), dtype=torch.bool, device=flat.device)
+        for size, cells in zip(CELL_SIZES_PX, (self.large, self.small), strict=True):
+            rows, is_there = cells.find(_keys(flat, self.origin, size * self.pixel_size))
+            counts = torch.where(is_there, cells.counts[rows], 0.0)[:, None]
+            sums = torch.where(is_there[:, None], cells.sums[rows], 0.0)
+            squares = (sums + _PRIOR_PIXELS * squares) / (counts + _PRIOR_PIXELS)
+            if cells is self.large:
+                is_known = is_there & (cells.views[rows] >= _FEWEST_VIEWS)
+        deviations = torch.where(is_known[:, None], (squares + _LEAST_SQUARE).sqrt(), torch.nan)
+        shape = positions.shape[:-1]
+        return LocalErrors(deviations[:, :-1].reshape(*shape, -1), deviations[:, -1].reshape(shape), self)
+
+    def over_region(
+        self, positions: Float[Tensor, "P 3"], weights: Float64[np.ndarray, " P"], edge: float
+    ) -> LocalErrors:
+        """Of means over a region of the surface, from places in it, what they weigh, and the edge of a square of its
+        area (model units)."""
+        own, parts = self.at(positions), torch.from_numpy(weights / weights.sum()).to(self.origin)
+        known = own.spectra.isfinite()
+        parts = torch.where(known, parts, 0.0)
+        total = parts.sum()
+        whole = torch.where(total >= 0.5, 1 / total.clamp(min=1e-12), torch.nan)
+        squares = [
+            whole * (parts.view(-1, *(1,) * (values.dim() - 1)) * values.nan_to_num().square()).sum(dim=0)
+            for values in (own.abundances, own.spectra)
+        ]
+        size = edge / float(self.pixel_size)
+        of_abundances, of_spectra = (
+            float(np.interp(np.log(max(size, 1e-9)), np.log(_REGION_SIZES_PX), shares.cpu().numpy()))
+            for shares in (self.abundance_alike, self.spectrum_alike)
+        )
+        return LocalErrors((of_abundances * squares[0]).sqrt(), (of_spectra * squares[1]).sqrt(), self)
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> PlaceErrors:
+        """The same after a change of device or precision."""
+        return PlaceErrors.of_tensors({name: function(values) for name, values in self.tensors().items()})
+
+    def tensors(self) -> dict[str, Tensor]:
+        """By name, as they are stored."""
+        found: dict[str, Tensor] = {}
+        for field in fields(self):
+            value = getattr(self, field.name)
+            parts = {"": value} if isinstance(value, Tensor) else vars(value)
+            found |= {f"{field.name}.{name}".rstrip("."): tensor for name, tensor in parts.items()}
+        return found
+
+    @staticmethod
+    def of_tensors(tensors: Mapping[str, Tensor]) -> PlaceErrors:
+        """The errors that `tensors` gave; a KeyError where one is missing, a ValueError where they do not fit."""
+        large, small = (
+            Cells(**{one.name: tensors[f"{size}.{one.name}"] for one in fields(Cells)})
+            for size in ("large", "small")
+        )
+        for cells in (large, small):
+            lengths = {len(values) for values in vars(cells).values()}
+            if len(lengths) != 1 or lengths == {0} or not bool((cells.keys.diff() > 0).all()):
+                raise ValueError("cells that do not fit together")
+        if not all(bool(values.isfinite().all()) for values in tensors.values()):
+            raise ValueError("values that are not finite")
+        plain: dict[str, Any] = {
+            one.name: tensors[one.name] for one in fields(PlaceErrors) if one.name not in ("large", "small")
+        }
+        return PlaceErrors(large=large, small=small, **plain)
+
+
+def _keys(
+    positions: Float[Tensor, "P 3"], origin: Float[Tensor, "3"], edge: float | Tensor
+) -> Int64[Tensor, "P"]:
+    """Numbers of the cells in which positions lie; far away ones share the outermost."""
+    half = 1 << (_INDEX_BITS - 1)
+    steps = ((positions.double() - origin.double()) / edge).floor().clamp(-half, half - 1).nan_to_num().long()
+    x, y, z = (steps + half).unbind(dim=-1)
+    return (x << 2 * _INDEX_BITS) | (y << _INDEX_BITS) | z
+
+
+def _cells(keys: Int64[Tensor, "N"], views: Int64[Tensor, "N"], squares: Float[Tensor, "N Q"]) -> Cells:
+    own, rows = keys.unique(return_inverse=True)
+    pairs = torch.stack([rows, views]).unique(dim=1)
+    return Cells(
+        own,
+        torch.bincount(rows, minlength=len(own)).to(squares),
+        torch.bincount(pairs[0], minlength=len(own)),
+        squares.new_zeros(len(own), squares.shape[1]).index_add_(0, rows, squares),
+    )
+
+
+def _without_own_view(
+    keys: Sequence[Int64[Tensor, "N"]],
+    views: Int64[Tensor, "N"],
+    squares: Float[Tensor, "N Q"],
+    usual: Float[Tensor, "Q"],
+) -> Float[Tensor, "N Q"]:
+    """Deviations that the cells of all other views expect of each pixel."""
+    expected = usual.expand(len(views), -1)
+    for own in keys:
+        counts, sums = [], []
+        for groups in (own, torch.stack([own, views])):
+            _, rows = groups.unique(return_inverse=True, dim=-1)
+            num = int(rows.max()) + 1
+            counts.append(torch.bincount(rows, minlength=num).to(squares)[rows, None])
+            sums.append(squares.new_zeros(num, squares.shape[1]).index_add_(0, rows, squares)[rows])
+        others, of_others = counts[0] - counts[1], (sums[0] - sums[1]).clamp(min=0)
+        expected = (of_others + _PRIOR_PIXELS * expected) / (others + _PRIOR_PIXELS)
+    return (expected + _LEAST_SQUARE).sqrt()
+
+
+def _alike(keys: Int64[Tensor, "N"], errors: Float[Tensor, "N Q"]) -> Float[Tensor, ""]:
+    """Mean product of the errors of two pixels of one cell, over their mean square: what of squared errors is left in
+    means over cells; [0, 1]."""
+    own, rows, counts = keys.unique(return_inverse=True, return_counts=True)
+    sums = errors.new_zeros(len(own), errors.shape[1]).index_add_(0, rows, errors)
+    squares = errors.new_zeros(len(own), errors.shape[1]).index_add_(0, rows, errors.square())
+    pairs, several = (counts * (counts - 1)).sum(), counts > 1
+    if not several.any():
+        return errors.new_ones(())
+    products = ((sums.square() - squares)[several].sum() / pairs).clamp(min=0)
+    usual = squares[several].sum() / counts[several].sum()
+    return (products / usual.clamp(min=1e-30)).clamp(max=1)
