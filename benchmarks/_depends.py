@@ -27,6 +27,7 @@ DEPENDS_ON: dict[str, tuple[str, ...]] = {
     "fuzz_commands": ("commands", "captures", "engine/runs"),
     "fuzz_guided": ("captures/readers", "formats"),
     "gpu": ("operators", "rendering", "engine", "viewer"),
+    "intervals": ("trained", "spectral", "losses/abundance_guide.py"),
     "kill": ("engine",),
     "landscapes": ("spectral/unmixing",),
     "lenses": ("captures/poses", "captures/writing"),

@@ -27,8 +27,10 @@ from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.formats.envi import read_header
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.settings import SceneOptions
+from unmix_plugin.trained.measured_errors import write_errors
 from unmix_plugin.trained.measures import keep_region
 from unmix_plugin.trained.open_run import load_run, open_run
+from unmix_plugin.trained.place_errors import PixelErrors, PlaceErrors
 from unmix_plugin.trained.regions import Box
 from unmix_plugin.trained.surface_mesh import TriangleMesh, vertex_areas
 
@@ -383,6 +385,48 @@ def test_a_report_with_the_find_scene_compares_and_is_self_contained(exported):
         "num_endmembers",
     ):
         assert re.search(text, outline.text), text
+
+
+def test_numbers_stand_between_the_ends_of_their_intervals(solid_copy):
+    loaded = load_run(solid_copy, "cpu")
+    scene, generator = loaded.materials_scene, torch.Generator().manual_seed(0)
+    low, high = scene.scene_box.aabb
+    places = low + torch.rand(20_000, 3, generator=generator) * (high - low)
+    size = (len(places), len(scene.materials.names))
+    abundances = 0.05 * torch.randn(size, generator=generator) + 0.02
+    spectra = 0.01 * torch.randn(len(places), len(scene.bands), generator=generator) + 0.01
+    views = torch.randint(0, 5, (len(places),), generator=generator)
+    found = PixelErrors(places, views, spectra, (abundances,), (torch.ones(size),))
+    write_errors(
+        solid_copy, PlaceErrors.fit(found, low, 0.25 * float((high - low).max())), loaded.training.steps
+    )
+
+    done(export, *words("regions", "--run", solid_copy))
+    with (solid_copy / "exports/regions/regions.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    for name in ("area_square_units", *scene.materials.names):
+        for row in rows:
+            low, value, high = (float(row[f"{name}{end}"]) for end in ("_low", "", "_high"))
+            assert low <= value <= high
+            assert low < high or name == "area_square_units"  # of a solid one
+    assert {row["area_cm2_low"] for row in rows} == {""}
+
+    keep_region(RunFolder(solid_copy), "all", Box((-90.0, -90.0, -90.0), (90.0, 90.0, 90.0)))
+    done(export, "spectrum", "--region", "all", "--run", solid_copy, "--device", "cpu")
+    folder = solid_copy / "exports/spectrum"
+    with (folder / "region_all.csv").open() as file:
+        assert all(
+            float(row["mean_low"]) <= float(row["mean"]) <= float(row["mean_high"])
+            for row in csv.DictReader(file)
+        )
+    facts = json.loads((folder / "region_all.json").read_text())
+    assert facts["interval"] == {"coverage": 0.9, "not_determined": None}
+    for name, value in facts["abundances"].items():
+        assert facts["abundances_low"][name] <= value <= facts["abundances_high"][name]
+
+    write_errors(solid_copy, None, loaded.training.steps)
+    said = done(export, *words("regions", "--run", solid_copy, "--overwrite")).out
+    assert "not determined: the run has no errors.safetensors" in " ".join(said.split())
 
 
 def test_a_report_keeps_what_it_is_about_with_the_run(solid_copy):

@@ -6,6 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from tests.method_factory import NUM_BANDS
 from tests.products.ball_model import RADIUS, ball_scene
@@ -16,9 +17,12 @@ from unmix_plugin.scenes.demo.scene import make_demo_scene
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.spectral.intervals import width_factor
 from unmix_plugin.trained.measured_errors import FILE_NAME, measure_errors, read_errors, write_errors
+from unmix_plugin.trained.measured_surface import MeasuredSurface
 from unmix_plugin.trained.place_errors import CELL_SIZES_PX, PixelErrors, PlaceErrors
-from unmix_plugin.trained.places import MeasuredScene
+from unmix_plugin.trained.places import MeasuredScene, NamedRegion, spectrum_at
+from unmix_plugin.trained.regions import Box, OfMaterial
 from unmix_plugin.trained.run_views import RunView
+from unmix_plugin.trained.surface_mesh import TriangleMesh
 
 PIXEL = 0.01
 VIEWS = 12
@@ -204,3 +208,35 @@ def test_where_there_is_no_honest_interval_it_says_why(measured):
 def test_what_has_no_interval_is_refused(measured, name):
     with pytest.raises(ConfigError, match="no interval of"):
         measured.output(name)
+
+
+@pytest.fixture(scope="module")
+def surface(measured):
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
+    return MeasuredSurface(measured, TriangleMesh(np.asarray(ball.vertices), np.asarray(ball.faces)))
+
+
+def test_a_material_covers_an_area_within_its_interval(surface):
+    found = surface.measure(OfMaterial(0), "upper")
+    interval = found.area_interval
+    assert interval.not_determined == ""
+    assert interval.low <= found.area <= interval.high
+    assert interval.high <= 1.01 * surface.areas.sum()
+    certain = replace(surface.scene.measured_errors, abundance_factors=torch.zeros(7))
+    sharp = MeasuredSurface(replace(surface.scene, measured_errors=certain), surface.mesh)
+    own = sharp.measure(OfMaterial(0), "upper").area_interval
+    assert own.width < 0.1 * found.area
+    assert own.width <= interval.width
+
+
+def test_a_region_has_intervals_of_its_means_and_a_reason_where_its_area_has_none(surface):
+    everywhere = Box((-99.0, -99.0, -99.0), (99.0, 99.0, 99.0))
+    place = spectrum_at(surface.scene, NamedRegion("all", everywhere, surface))
+    interval = place.probe.interval("abundances")
+    assert interval.not_determined == ""
+    assert ((interval.low <= place.probe.abundances) & (place.probe.abundances <= interval.high)).all()
+    assert place.region is not None
+    assert "edges of boxes" in place.region.area_interval.not_determined
+    untold = MeasuredSurface(replace(surface.scene, measured_errors="nobody looked"), surface.mesh)
+    region = untold.measure(everywhere, "all")
+    assert (region.errors, region.area_interval.not_determined) == ("nobody looked",) * 2

@@ -5,6 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 from html.parser import HTMLParser
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.figures.paint import ColourScale
 from unmix_plugin.formats.files import write_file
+from unmix_plugin.spectral.intervals import Interval
 from unmix_plugin.viewer import page
 from unmix_plugin.viewer.page import Debounced, choice, new_file, number, text
 from unmix_plugin.viewer.rendering.painting import legend_html
@@ -150,6 +152,16 @@ def test_a_colour_bar_says_its_values_and_bars_are_as_long_as_theirs_and_never_l
     red = (1.0, 0.0, 0.0)
     content = page.bars([("a", 0.25, red), ("b", 7.0, red), ("c", -1.0, red)])
     assert all(f"width:{width}" in content for width in ("25.0%", "100.0%", "0.0%"))
+
+
+def test_bars_say_the_interval_of_each_value_or_why_there_is_none():
+    red, low, high = (1.0, 0.0, 0.0), np.array([0.1, 0.6]), np.array([0.4, 0.8])
+    entries = [("a", 0.25, red), ("b", 0.75, red)]
+    found = Collector(page.bars(entries, Interval(low, high, 0.9))).text
+    assert found.index("b") < found.index("0.60 to 0.80") < found.index("0.10 to 0.40")
+    untold = page.bars(entries, Interval.unknown(low, 0.9, EVIL))
+    assert not {"script", "img"} & set(Collector(untold).tags)
+    assert "not determined" in Collector(untold).text
 
 
 def test_a_message_that_is_logged_steers_no_terminal(caplog):

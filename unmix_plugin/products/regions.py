@@ -66,7 +66,8 @@ def export(job: Job, asked: Regions) -> list[Path]:
 
 
 def _measure_all(job: Job) -> list[Path]:
-    """Write regions.csv (area and abundances of each kept region and of each material), regions-spectra.csv (mean and
+    """Write regions.csv (area and abundances of each kept region and of each material, each number with the ends of its
+    90 % interval, empty where not determined), regions-spectra.csv (mean and
     standard deviation), and the means as the library regions.sli."""
     table, spectra = job.folder / "regions.csv", job.folder / "regions-spectra.csv"
     job.claim([table, spectra, *envi_library_paths(job.folder / "regions")])
@@ -76,16 +77,27 @@ def _measure_all(job: Job) -> list[Path]:
     for reason in failed.values():
         job.say(reason)
     factor = None if scale is None else 1e4 * scale.metres_per_unit**2
-    rows = [["name", "area_square_units", "area_cm2", *names]]
+    columns = ("area_square_units", "area_cm2", *names)
+    rows = [["name", *(f"{column}{end}" for column in columns for end in ("", "_low", "_high"))]]
+    reasons: dict[str, None] = {}
     for name, one in found.items():
-        area_cm2 = "" if factor is None else f"{one.area * factor:.6g}"
-        rows.append([name, f"{one.area:.6g}", area_cm2, *(f"{share:.6g}" for share in one.abundances)])
+        of_abundances, area = one.probe.interval("abundances"), one.area_interval
+        values = np.array([one.area, np.nan if factor is None else one.area * factor, *one.abundances])
+        ends = [
+            np.array([end, np.nan if factor is None else end * factor, *others])
+            for end, others in ((area.low, of_abundances.low), (area.high, of_abundances.high))
+        ]
+        numbers = np.stack([values, *ends], axis=1).ravel()
+        rows.append([name, *(f"{number:.6g}" if np.isfinite(number) else "" for number in numbers)])
         job.say(f"{name}: {one.in_words(names, scale)}")
+        reasons |= dict.fromkeys(filter(None, (of_abundances.not_determined, area.not_determined)))
+    for reason in reasons:
+        job.say(f"intervals that are empty in regions.csv are not determined: {reason}")
     make_folder(job.folder)
     write_file(table, csv_bytes(rows))
-    columns = [f"{name} {what}" for name in found for what in ("mean", "standard deviation")]
+    titles = [f"{name} {what}" for name in found for what in ("mean", "standard deviation")]
     values = np.stack([row for one in found.values() for row in (one.mean, one.spread)]).clip(min=0)
-    write_spectra_csv(spectra, SpectraTable(job.materials.bands, tuple(columns), values))
+    write_spectra_csv(spectra, SpectraTable(job.materials.bands, tuple(titles), values))
     means = np.stack([one.mean for one in found.values()]).astype(np.float32)
     about = f"mean spectra of regions: {job.materials.quantity}, 1 = full scale"
     library = write_envi_library(job.folder / "regions", means, job.materials.bands, tuple(found), about)

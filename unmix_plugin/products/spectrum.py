@@ -198,6 +198,10 @@ def _write_spectrum(folder: Path, place: _ProbedPlace, scene: TrainedScene) -> l
             columns[f"standard deviation over views{place.unedited}"] = place.over_views.spread
     if place.spread is not None:
         columns = {"mean": columns["predicted"].clip(min=0), "standard deviation": place.spread}
+    interval = place.probe.interval("predicted")
+    if not interval.not_determined:
+        name = "predicted" if place.spread is None else "mean"
+        columns |= {f"{name}_low": interval.low, f"{name}_high": interval.high}
     values = np.stack(list(columns.values()))
     write_spectra_csv(table_path, SpectraTable(materials.bands, tuple(columns), values))
     facts = {**_facts(place, materials), "scale": describe_scale(scene.scale)}
@@ -221,6 +225,17 @@ def _draw_spectrum(place: _ProbedPlace, materials: Materials) -> bytes:
     if place.over_views is not None:
         mean, spread = place.over_views.mean, place.over_views.spread
         label = f"{len(place.over_views.views)} training views{place.unedited}, ± 1 std. dev."
+    interval = place.probe.interval("predicted")
+    if not interval.not_determined:
+        lines.fill_between(
+            wavelengths,
+            interval.low,
+            interval.high,
+            color="C0",
+            alpha=0.2,
+            linewidth=0,
+            label="90 % interval",
+        )
     if spread is not None:
         lines.fill_between(wavelengths, mean - spread, mean + spread, color="0.85", label=label)
     for style, shown in zip(("--", "-.", ":"), place.matches, strict=False):
@@ -241,9 +256,17 @@ def _draw_abundances(axes: Any, probe: Probe, materials: Materials) -> None:
     """The largest abundances as bars, the largest on top."""
     chosen = np.argsort(-probe.abundances, kind="stable")[:_MOST_BARS]
     colours = endmember_colours(materials)
+    interval = probe.interval("abundances")
+    reach = None
+    if not interval.not_determined:
+        reach = np.stack([probe.abundances - interval.low, interval.high - probe.abundances]).clip(min=0)[
+            :, chosen
+        ]
     axes.barh(
         range(len(chosen)),
         probe.abundances[chosen],
+        xerr=reach,
+        ecolor="0.2",
         color=[tuple(colours[index]) for index in chosen],
         edgecolor="0.3",
         linewidth=0.6,
@@ -259,6 +282,13 @@ def _facts(place: _ProbedPlace, materials: Materials) -> dict[str, Any]:
     probe = place.probe
     is_something = probe.opacity >= OCCUPIED_ACCUMULATION
     shares = dict(zip(materials.names, probe.abundances.tolist(), strict=True))
+    interval = probe.interval("abundances")
+    ends = {
+        f"abundances_{end}": None
+        if interval.not_determined
+        else dict(zip(materials.names, values, strict=True))
+        for end, values in (("low", interval.low.tolist()), ("high", interval.high.tolist()))
+    }
     position = probe.world_position
     return {
         **place.facts,
@@ -267,6 +297,8 @@ def _facts(place: _ProbedPlace, materials: Materials) -> dict[str, Any]:
         "measured_in_views": None if place.over_views is None else len(place.over_views.views),
         "material": materials.name_of(probe.spectra["predicted"], probe.abundances) if is_something else None,
         "abundances": shares,
+        **ends,
+        "interval": {"coverage": interval.coverage, "not_determined": interval.not_determined or None},
         "library": [match_json(shown.match) for shown in place.matches],
     }
 

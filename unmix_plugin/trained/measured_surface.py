@@ -19,7 +19,11 @@ from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from unmix_plugin.errors import ConfigError
+from unmix_plugin.spectral.intervals import COVERAGE, Interval, width_factor
+from unmix_plugin.trained.intervals import TOO_FEW_VIEWS
 from unmix_plugin.trained.measures import Scale, describe_area
+from unmix_plugin.trained.place_errors import LocalErrors, PlaceErrors
+from unmix_plugin.trained.protocol import Probe
 from unmix_plugin.trained.regions import Box, InView, OfMaterial, Region
 from unmix_plugin.trained.surface import Follow, SeenSurface, SurfaceAppearance, in_image, look_from_above
 from unmix_plugin.trained.surface_mesh import TriangleMesh, Working, surface_of
@@ -49,6 +53,15 @@ class MeasuredRegion:
     """Triangles of which more than half is in it."""
     vertex_areas: Float64[np.ndarray, " V"]
     """Its part of what each vertex stands for, a third of its triangles; square units of the world."""
+    errors: LocalErrors | str
+    """How far its means are expected to be off, or why that is unknown, for people."""
+    area_interval: Interval
+    """Where its area lies: as far as a material's outline, or a region's edges on the surface, may be elsewhere."""
+
+    @property
+    def probe(self) -> Probe:
+        """Its means, as what a place shows."""
+        return Probe({"predicted": self.mean, "abundances": self.abundances}, 1.0, None, None, self.errors)
 
     def in_words(self, names: Sequence[str], scale: Scale | None) -> str:
         """Area and largest shares for people."""
@@ -113,12 +126,51 @@ class MeasuredSurface:
                 f"{' '.join(f'{x:g}' for x in world.min(axis=0))} and {' '.join(f'{x:g}' for x in world.max(axis=0))} "
                 "of the world"
             )
+        errors, area_interval = self._uncertainty(region, weights)
         share = weights / area
         spectra = self._diffuse.double().numpy()
         mean = share @ spectra
         spread = np.sqrt(share @ (spectra - mean) ** 2)
         abundances = share @ self._abundances.double().numpy()
-        return MeasuredRegion(area, mean, spread, abundances, fractions.mean(axis=1) > 0.5, weights)
+        is_inside = fractions.mean(axis=1) > 0.5
+        return MeasuredRegion(area, mean, spread, abundances, is_inside, weights, errors, area_interval)
+
+    def _uncertainty(
+        self, region: Region, weights: Float64[np.ndarray, " V"]
+    ) -> tuple[LocalErrors | str, Interval]:
+        """Errors of means over a region, from its part of what each vertex stands for, and the interval of its area."""
+        errors, area = self.scene.errors, np.asarray(weights.sum())
+        if isinstance(errors, str):
+            return errors, Interval.unknown(area, COVERAGE, errors)
+        positions = torch.from_numpy(self.mesh.vertices).float()
+        edge = float(area) ** 0.5 * self.scene.frame.scale
+        inside = weights > 0
+        found = errors.over_region(positions[torch.from_numpy(inside)], weights[inside], edge)
+        if not bool(found.spectra.isfinite()):
+            return found, Interval.unknown(area, COVERAGE, TOO_FEW_VIEWS)
+        if not isinstance(region, OfMaterial):
+            reason = "how exactly edges of boxes and outlines lie on the surface is not measured"
+            return found, Interval.unknown(area, COVERAGE, reason)
+        margins = self._margins(region.material, errors, edge)
+        whole = np.bincount(self.mesh.faces.ravel(), np.repeat(self.areas / 3, 3), len(positions))
+        low, high = (np.asarray(whole[margins > sign].sum()) for sign in (1, -1))
+        low, high = (np.asarray(end) for end in (np.minimum(low, area), np.maximum(high, area)))
+        return found, Interval(low, high, COVERAGE)
+
+    def _margins(self, material: int, errors: PlaceErrors, edge: float) -> Float64[np.ndarray, " V"]:
+        """How far a material is above the largest other one at each vertex, in half widths of the interval that errors
+        shared by a region with this edge (model units) leave; where errors are unknown, beyond any."""
+        local = errors.at(torch.from_numpy(self.mesh.vertices).float())
+        deviations = local.abundances.cpu().double().numpy()
+        abundances = self._abundances.double().numpy()
+        others = np.where(np.arange(abundances.shape[1]) == material, -1.0, abundances)
+        second = others.argmax(axis=1)
+        rows = np.arange(len(abundances))
+        # What one has too much the other has too little: their errors add up.
+        half = deviations[:, material] + deviations[rows, second]
+        half *= width_factor(errors.abundance_factors, COVERAGE) * errors.alike(edge)[0] ** 0.5
+        margins = abundances[:, material] - others[rows, second]
+        return np.where(np.isfinite(half), margins / np.maximum(half, 1e-9), np.sign(margins) * np.inf)
 
 
 def points_in(

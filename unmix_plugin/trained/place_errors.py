@@ -186,12 +186,18 @@ class PlaceErrors:
             whole * (parts.view(-1, *(1,) * (values.dim() - 1)) * values.nan_to_num().square()).sum(dim=0)
             for values in (own.abundances, own.spectra)
         ]
-        size = edge / float(self.pixel_size)
+        of_abundances, of_spectra = self.alike(edge)
+        return LocalErrors((of_abundances * squares[0]).sqrt(), (of_spectra * squares[1]).sqrt(), self)
+
+    def alike(self, edge: float) -> tuple[float, float]:
+        """Share of the squared errors of abundances, and of spectra, that is left in the mean over a region with this
+        edge (model units)."""
+        size = np.log(max(edge / float(self.pixel_size), 1e-9))
         of_abundances, of_spectra = (
-            float(np.interp(np.log(max(size, 1e-9)), np.log(_REGION_SIZES_PX), shares.cpu().numpy()))
+            float(np.interp(size, np.log(_REGION_SIZES_PX), shares.cpu().double().numpy()))
             for shares in (self.abundance_alike, self.spectrum_alike)
         )
-        return LocalErrors((of_abundances * squares[0]).sqrt(), (of_spectra * squares[1]).sqrt(), self)
+        return of_abundances, of_spectra
 
     def map(self, function: Callable[[Tensor], Tensor]) -> PlaceErrors:
         """The same after a change of device or precision."""

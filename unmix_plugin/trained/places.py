@@ -192,8 +192,7 @@ def spectrum_at(scene: TrainedScene, place: Place, measured: MeasuredScene | Non
     place is outside of the image or the scene box, or the region has nothing in it."""
     if isinstance(place, NamedRegion):
         found = place.surface.measure(place.region, place.name)
-        values = {"predicted": found.mean, "abundances": found.abundances}
-        return PlaceSpectrum(Probe(values, 1.0, None, None), region=found)
+        return PlaceSpectrum(found.probe, region=found)
     probe = scene.probe(*place) if isinstance(place, Pixel) else scene.probe_point(*place)
     if measured is None or probe.position is None or probe.opacity < OCCUPIED_ACCUMULATION:
         return PlaceSpectrum(probe)

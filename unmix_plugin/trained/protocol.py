@@ -77,9 +77,10 @@ class Probe:
 
 def seen_place(probe: Probe, errors: LocalErrors) -> SeenPlaces:
     """What a probe shows, as intervals are made of it."""
-    spectrum = torch.from_numpy(probe.values["predicted"] / max(probe.opacity, 1e-6)).to(errors.spectra)
-    abundances = torch.from_numpy(probe.values["abundances"]).to(errors.spectra)
-    return SeenPlaces(spectrum, abundances, torch.tensor(probe.opacity).to(errors.spectra), errors)
+    device = errors.spectra.device
+    spectrum = torch.from_numpy(probe.values["predicted"] / max(probe.opacity, 1e-6)).to(device)
+    abundances = torch.from_numpy(probe.values["abundances"]).to(device)
+    return SeenPlaces(spectrum, abundances, torch.tensor(probe.opacity, device=device), errors)
 
 
 @runtime_checkable

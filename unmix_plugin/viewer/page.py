@@ -20,6 +20,7 @@ from unmix_plugin.engine.runs.replacing import claim
 from unmix_plugin.errors import ConfigError, UnmixError
 from unmix_plugin.figures.plotting import css_colour
 from unmix_plugin.formats.files import make_folder, safe_name, write_errors_as
+from unmix_plugin.spectral.intervals import Interval
 
 if TYPE_CHECKING:
     import viser
@@ -137,16 +138,27 @@ def paragraph(text: str, is_warning: bool = False) -> str:
     return f'<div style="{BLOCK_STYLE}{colour}">{escape(text)}</div>'
 
 
-def bars(entries: Iterable[tuple[str, float, Sequence[float]]]) -> str:
-    """Names, values in [0, 1] and sRGB colours as horizontal bars, the 16 largest."""
+def bars(entries: Iterable[tuple[str, float, Sequence[float]]], interval: Interval | None = None) -> str:
+    """Names, values in [0, 1] and sRGB colours as horizontal bars, the 16 largest; with their interval, if there is
+    one, or why it is not determined."""
+    shown = list(entries)
+    ends, note = [""] * len(shown), ""
+    if interval is not None and interval.not_determined:
+        note = f'<div style="opacity:0.7">interval not determined: {escape(interval.not_determined)}</div>'
+    elif interval is not None:
+        ends = [f"{low:.2f} to {high:.2f}" for low, high in zip(interval.low, interval.high, strict=True)]
+        note = f'<div style="opacity:0.7">and {interval.coverage:.0%} interval</div>'
+    ordered = sorted(zip(shown, ends, strict=True), key=lambda pair: -pair[0][1])[:16]
     rows = (
         f'{_ROW}<span style="flex:0 0 8.5em;overflow-wrap:anywhere">{escape(name)}</span>'
         '<span style="flex:1;background:#8883;height:0.8em"><span style="display:block;height:100%;'
         f'width:{100 * min(max(value, 0.0), 1.0):.1f}%;background:{css_colour(colour)}"></span></span>'
-        f'<span style="flex:0 0 2.6em;text-align:right">{value:.2f}</span></div>'
-        for name, value, colour in sorted(entries, key=lambda entry: -entry[1])[:16]
+        f'<span style="flex:0 0 2.6em;text-align:right">{value:.2f}</span>'
+        + (f'<span style="flex:0 0 6.5em;text-align:right;opacity:0.7">{reach}</span>' if reach else "")
+        + "</div>"
+        for (name, value, colour), reach in ordered
     )
-    return f'<div style="{BLOCK_STYLE}">{"".join(rows)}</div>'
+    return f'<div style="{BLOCK_STYLE}">{"".join(rows)}{note}</div>'
 
 
 def table(rows: Sequence[tuple[str, str]]) -> str:

@@ -279,14 +279,29 @@ def material_cards(
 def region_card(
     name: str, found: MeasuredRegion, materials: Materials, scale: Scale | None
 ) -> dict[str, Any]:
-    """A card for a region: its mean spectrum with one standard deviation to either side, and what it is made of."""
+    """A card for a region: its mean spectrum with one standard deviation to either side, and what it is made of, with
+    intervals where they are determined."""
     nm, grey = materials.bands.centers_nm, "#7a838b"
     lines = [
         ChartLine(nm, found.mean - found.spread, "mean less standard deviation", grey, 1.5, "dashed"),
         ChartLine(nm, found.mean + found.spread, "mean and standard deviation", grey, 1.5, "dashed"),
         ChartLine(nm, found.mean, "mean", "#1c2024", 3.0),
     ]
-    entries = zip(materials.names, endmember_colours(materials), found.abundances.tolist(), strict=True)
+    interval, of_area = found.probe.interval("abundances"), found.area_interval
+    reaches = [""] * len(materials.names)
+    if not interval.not_determined:
+        reaches = [f"{low:.3f} to {high:.3f}" for low, high in zip(interval.low, interval.high, strict=True)]
+    colours = endmember_colours(materials)
+    entries = zip(materials.names, colours, found.abundances.tolist(), reaches, strict=True)
     shares = sorted(entries, key=lambda entry: -entry[2])
     chart, area = SpectraChart(lines, materials.quantity), describe_area(found.area, scale)
-    return {"name": name, "area": area, "chart": chart, "shares": shares}
+    if not of_area.not_determined:
+        ends = (describe_area(float(end), scale) for end in (of_area.low, of_area.high))
+        area += f" (90 % interval: {' to '.join(ends)})"
+    return {
+        "name": name,
+        "area": area,
+        "chart": chart,
+        "shares": shares,
+        "not_determined": interval.not_determined,
+    }

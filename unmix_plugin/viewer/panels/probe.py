@@ -111,16 +111,20 @@ def _spectra_csv(probes: Sequence[_ProbedPoint]) -> bytes:
 
 def _abundances_csv(probes: Sequence[_ProbedPoint], scale: Scale | None = None) -> bytes:
     """One row a probe: number, position in the world, metres in a unit of it (empty where unknown), material, the
-    training views measured in, what the spectra are, the light lit in place of the recorded one, abundances."""
+    training views measured in, what the spectra are, the light lit in place of the recorded one, abundances, each with
+    the ends of its 90 % interval, empty where that is not determined."""
     metres = "" if scale is None else f"{scale.metres_per_unit:.9g}"
     header = ["probe", "x", "y", "z", METRES_KEY, "material", "measured_in", "quantity", "light"]
     names = dict.fromkeys(name for one in probes for name in one.materials.names)  # renamed between probes
-    rows = [[*header, *names]]
+    rows = [[*header, *(f"{name}{end}" for name in names for end in ("", "_low", "_high"))]]
     for one in probes:
         place = [str(one.number), *(f"{value:.9g}" for value in one.world), metres]
         what = [one.material, one.measured_in, one.materials.quantity, one.materials.light_name or ""]
-        shares = dict(zip(one.materials.names, one.found.abundances, strict=True))
-        rows.append([*place, *what, *(f"{shares[name]:.6g}" if name in shares else "" for name in names)])
+        interval = one.found.interval("abundances")
+        numbers = np.stack([one.found.abundances, interval.low, interval.high], axis=1)
+        shares = dict(zip(one.materials.names, numbers, strict=True))
+        own = np.concatenate([shares.get(name, np.full(3, np.nan)) for name in names])
+        rows.append([*place, *what, *(f"{number:.6g}" if np.isfinite(number) else "" for number in own)])
     return csv_bytes(rows)
 
 
@@ -191,7 +195,8 @@ class ProbePanel:
             ]
         )
         colours = self._session.colours_of(materials)
-        self._bars.content = bars(zip(materials.names, abundances.tolist(), colours, strict=True))
+        interval = shown.found.interval("abundances")
+        self._bars.content = bars(zip(materials.names, abundances.tolist(), colours, strict=True), interval)
         lines = [Line("predicted", shown.predicted, shown.colour)]
         if shown.measured is not None:
             name = f"measured, {shown.measured_in}"

@@ -175,7 +175,8 @@ class RegionsPanel:
         area = describe_area(region.area, session.services.source.scale)
         self._found.content = table([("area", area), ("of", "the run as it was trained, without edits")])
         colours = session.colours_of(materials)
-        self._bars.content = bars(zip(materials.names, region.abundances.tolist(), colours, strict=True))
+        shares = zip(materials.names, region.abundances.tolist(), colours, strict=True)
+        self._bars.content = bars(shares, region.probe.interval("abundances"))
         colour = [value / 255 for value in _COLOUR]
         lines = [Line("mean", region.mean, colour)]
         for name, spread in (("mean + std. dev.", region.spread), ("mean - std. dev.", -region.spread)):
