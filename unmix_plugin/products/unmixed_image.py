@@ -32,7 +32,9 @@ _FIRST_COLOURS = np.array(
 
 def unmixed_image_paths(folder: Path, has_library: bool, has_fractions: bool) -> list[Path]:
     """Files that `write_unmixed_image` makes."""
-    cubes = [path for name in ("abundances", "confidence") for path in envi_cube_paths(folder / name)]
+    cubes = [
+        path for name in ("abundances", "intervals", "confidence") for path in envi_cube_paths(folder / name)
+    ]
     cubes += [folder / "angles.csv"] if has_library else []
     cubes += [*envi_cube_paths(folder / "mnf"), folder / "mnf.csv"] if has_fractions else []
     return [*(folder / name for name in ("endmembers.csv", "endmembers.png", "maps.png")), *cubes]
@@ -75,6 +77,14 @@ def write_unmixed_image(
     write_file(folder / "maps.png", _maps(found, names, colours))
     about = f"abundances: shares of {found.shares}, 0 to 1"
     write_envi_cube(folder / "abundances", found.abundances, None, names, about, on_map)
+    interval = found.interval()
+    ends = np.concatenate([interval.low, interval.high], axis=-1).astype(np.float32)
+    end_names = [f"{name}{end}" for end in ("_low", "_high") for name in names]
+    reason = (
+        f"not determined: {interval.not_determined}" if interval.not_determined else "NaN without abundances"
+    )
+    about = f"ends of the {interval.coverage:.0%} intervals of abundances; {reason}"
+    write_envi_cube(folder / "intervals", ends, None, end_names, about, on_map)
     trust = np.stack([found.confidence, found.misfit], axis=-1)
     about = (
         "probability that the largest abundance is the largest in truth; angle between pixel and mixture, rad"

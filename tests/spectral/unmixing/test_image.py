@@ -201,3 +201,30 @@ def test_abundances_of_shaded_mixtures_are_found_whatever_the_seed():
 def test_a_nearly_black_material_is_counted_between_spectra_of_one_peak():
     pixels, materials = landscape(dark=0.05)
     assert error_of(pixels, materials, materials / materials.amax(dim=1, keepdim=True))[0] < 0.06
+
+
+@pytest.mark.usefixtures("few_searches")
+def test_intervals_of_a_noisy_image_are_wider_and_both_hold_most_true_shares():
+    materials, widths = smooth_endmembers(3), []
+    for noise in (0.002, 0.03):
+        found = inspect.unwrap(unmix_image)(image_of(materials, noise=noise), 3)
+        interval = found.interval()
+        assert np.isnan(interval.low[0, 0]).all()  # it is black
+        widths.append(float(np.nanmedian(interval.width)))
+        seen = found.abundances.sum(axis=-1) > 0
+        assert ((interval.low <= found.abundances) & (found.abundances <= interval.high))[seen].all()
+        assert (interval.width <= found.interval(0.99).width)[seen].all()
+        angles = spectral_angle(materials[:, None].float(), torch.from_numpy(found.endmembers)[None])
+        own = angles.argmin(dim=1).numpy()[np.arange(1, 800) % 3]  # the first half is pure
+        high = interval.high.reshape(-1, 3)[1:800]
+        assert (high[np.arange(799), own] > 0.99).mean() > 0.86
+    assert widths[0] < 0.1
+    assert widths[1] > 1.5 * widths[0]
+
+
+@pytest.mark.usefixtures("few_searches")
+def test_of_one_material_no_interval_is_given():
+    shade = torch.rand(20, 20, 1, generator=seeded()) + 0.2
+    interval = inspect.unwrap(unmix_image)((shade * smooth_endmembers(1)[0].float()).numpy(), 1).interval()
+    assert "one material" in interval.not_determined
+    assert np.isnan(interval.width).all()

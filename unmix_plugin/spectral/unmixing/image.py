@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Float32, Shaped
 from torch import Tensor
 
 from unmix_plugin.errors import SpectrumError, counted
+from unmix_plugin.spectral.intervals import COVERAGE, Interval, propagated_deviation, width_factor
 from unmix_plugin.spectral.metrics import spectral_angle
 from unmix_plugin.spectral.unmixing.abundances import nnls
 from unmix_plugin.spectral.unmixing.endmembers import (
@@ -33,6 +34,15 @@ _PIXELS_TO_COUNT_BY = 20_000
 _SHARED_MARGIN_ERROR = 0.6
 """Standard error of a margin where all sets agree: of what they get wrong alike. With it, of the pixels of artificial
 landscapes about as many are right as the confidence says."""
+
+_DIRECTIONS, _LEAST_SCALE = 4, 0.3
+"""Of misfits that are followed through the unmixing, and the least misfit of a pixel in usual ones."""
+_ALIKE, _ALIKE_IN_MIXTURES, _LEAST_ERROR = 0.1, 4.0, 0.01
+"""What all sets get wrong alike, in the image's mean square of what they do not; times a (1 - a), what mixtures have
+more of it; the least expected error. An image that is hard to unmix misleads all searches."""
+_WIDTH_FACTORS = (0.25, 0.45, 0.72, 1.1, 2.0, 3.2, 9.4)
+"""Half widths of intervals in expected errors, for each of COVERAGES: of ten artificial landscapes of even number, so
+many abundances had smaller errors."""
 
 Shares = Literal["auto", "area", "light"]
 """What abundances are shares of.
@@ -54,12 +64,30 @@ class UnmixedImage:
     confidence: Float32[np.ndarray, "H W"]
     """Estimated probability that a pixel's largest abundance is its largest in truth, by its margin over the second and
     how far the best searches agree, 0.95 at most; 0 where there are no abundances."""
+    deviation: Float32[np.ndarray, "H W K"]
+    """Expected error of each abundance, by which intervals are made; 0 where there are no abundances."""
     misfit: Float32[np.ndarray, "H W"]
     """Angle in radians between a pixel and its mixture; 0 where there are no abundances."""
     shares: Literal["area", "light"]
     """What abundances are shares of."""
     evidence: str
     """Why so many materials, in a few lines; empty where the number was given."""
+
+    def interval(self, coverage: float = COVERAGE) -> Interval:
+        """Where each abundance lies, (H, W, K), with this probability; NaN where there are no abundances, and not
+        determined of a single material. A ConfigError where intervals of that coverage can't be given."""
+        half = width_factor(torch.tensor(_WIDTH_FACTORS), coverage) * self.deviation.astype(np.float64)
+        values = self.abundances.astype(np.float64)
+        if values.shape[2] == 1:
+            reason = (
+                "of one material there is nothing to be mixed with, and whether another is missing is unknown"
+            )
+            return Interval.unknown(values, coverage, reason)
+        has_abundances = values.sum(axis=2, keepdims=True) > 0
+        low, high = (
+            np.where(has_abundances, end.clip(0, 1), np.nan) for end in (values - half, values + half)
+        )
+        return Interval(low, high, coverage)
 
 
 def unmix_image(
@@ -117,12 +145,14 @@ def unmix_image(
     order = _shares(amounts).sum(dim=0).argsort(descending=True)
     own = _shares(amounts[:, order])
     certain = _confidence(pixels, own, found, compared, order)
+    deviation = _deviation(pixels, own, found, compared, order)
     is_lit = amounts.sum(dim=1) > 0
     misfit = torch.where(is_lit, spectral_angle(pixels, amounts @ compared), 0.0)
     return UnmixedImage(
         (lit[order] * (brightest / _LIT)).numpy(),
         _placed(own, used),
         _placed(torch.where(is_lit, certain, 0.0), used),
+        _placed(torch.where(is_lit[:, None], deviation, 0.0), used),
         _placed(misfit, used),
         "area" if torch.equal(compared, lit) else "light",
         evidence,
@@ -204,6 +234,34 @@ def _confidence(
         squares += (margins - first + second).square()
     error = (squares / len(found.others) + _SHARED_MARGIN_ERROR**2).sqrt()
     return torch.special.ndtr(margins / error)
+
+
+def _deviation(
+    pixels: Float[Tensor, "N B"],
+    own: Float[Tensor, "N K"],
+    found: PooledEndmembers,
+    compared: Float[Tensor, "K B"],
+    order: Tensor,
+) -> Float[Tensor, "N K"]:
+    """Expected errors of shares: what the misfits of pixels become through the unmixing, how far the best sets of
+    endmembers differ, and what all sets get wrong alike."""
+    if own.shape[1] == 1:
+        return torch.zeros_like(own)
+    ordered = compared[order]
+    misfits = pixels - nnls(pixels, ordered) @ ordered
+    eigen = torch.linalg.eigh((misfits.T @ misfits).double() / len(misfits))
+    kept = slice(-min(_DIRECTIONS, misfits.shape[1]), None)
+    directions = (eigen.eigenvectors[:, kept] * eigen.eigenvalues[kept].clamp(min=0).sqrt()).T.to(pixels)
+    sizes = misfits.square().mean(dim=1).sqrt()
+    scales = (sizes / sizes.square().mean().sqrt().clamp(min=1e-12)).clamp(min=_LEAST_SCALE)
+    own_errors = propagated_deviation(lambda one: _shares(nnls(one, ordered)), pixels, directions, scales)
+    of_sets = torch.zeros_like(own)
+    for other in found.others:
+        shares = _shares(nnls(pixels, other * compared.norm(dim=1, keepdim=True)))[:, order]
+        of_sets += (shares - own).square() / len(found.others)
+    known = own_errors.square() + of_sets
+    alike = known.mean() * (_ALIKE + _ALIKE_IN_MIXTURES * own * (1 - own))
+    return (known + alike + _LEAST_ERROR**2).sqrt()
 
 
 def _placed(values: Tensor, used: Bool[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W *rest"]:
