@@ -24,7 +24,7 @@ import tyro
 from PIL import Image
 
 from unmix_plugin.captures.options import ProcessOptions
-from unmix_plugin.captures.poses.lens import Lens, Points, Project, bend_fisheye, bend_ftheta, fit_lens
+from unmix_plugin.captures.poses.lens import Lens, Points, Project, distort_fisheye, distort_ftheta, fit_lens
 from unmix_plugin.captures.process import process_capture
 from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.scenes.demo.scene import demo_cameras, radiance_cube
@@ -63,9 +63,9 @@ def _radial(ideal: Points) -> Points:
 _FISHEYE_FOCAL = WIDTH / 2 / np.radians(60.0)
 _FTHETA = (0.0, 0.016, 0.0, 6e-7)
 LENSES: dict[str, Project] = {
-    "fisheye of 120 degrees": lambda ideal: bend_fisheye(ideal, 0.02, -0.01) * _FISHEYE_FOCAL + _CENTER,
+    "fisheye of 120 degrees": lambda ideal: distort_fisheye(ideal, 0.02, -0.01) * _FISHEYE_FOCAL + _CENTER,
     "radial about a centre of its own": _radial,
-    "ftheta": lambda ideal: bend_ftheta(ideal, 200.0, *_FTHETA) / _FTHETA[1] + _CENTER,
+    "ftheta": lambda ideal: distort_ftheta(ideal, 200.0, *_FTHETA) / _FTHETA[1] + _CENTER,
 }
 _KEYS: dict[str, dict[str, Any]] = {
     "fisheye of 120 degrees": {

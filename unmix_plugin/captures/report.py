@@ -317,7 +317,7 @@ class Code(Enum):
         "grows with exposure, so take a dark frame at each"
     )
     EXPOSURES_OF_PICTURES = _wrong(
-        "pictures were exposed {exposed} {unit}, which can't be undone as cameras bend the brightness of pictures:"
+        "pictures were exposed {exposed} {unit}, which can't be undone as cameras encode the brightness of pictures:"
         " fix the exposure"
     )
     EXPOSURES_OF_REFLECTANCES = _wrong(

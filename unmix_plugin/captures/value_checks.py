@@ -220,10 +220,10 @@ def _excess(
     """
     low, middle, high = wavelengths_nm[:-2], wavelengths_nm[1:-1], wavelengths_nm[2:]
     part = (middle - low) / (high - low)
-    bends = np.zeros_like(logs)
-    bends[:, 1:-1] = logs[:, 1:-1] - logs[:, :-2] * (1 - part) - logs[:, 2:] * part
+    curvatures = np.zeros_like(logs)
+    curvatures[:, 1:-1] = logs[:, 1:-1] - logs[:, :-2] * (1 - part) - logs[:, 2:] * part
     excess = np.zeros_like(logs)
-    excess[:, 2:-2] = (bends[:, 2:-2] - 0.5 * (bends[:, 1:-3] + bends[:, 3:-1])) / 1.5
+    excess[:, 2:-2] = (curvatures[:, 2:-2] - 0.5 * (curvatures[:, 1:-3] + curvatures[:, 3:-1])) / 1.5
     steps = np.diff(wavelengths_nm)
     for step in np.flatnonzero(steps > _GAP * np.median(steps)):
         excess[:, max(0, step - 1) : step + 3] = 0.0

@@ -146,7 +146,7 @@ def test_what_may_be_wrong_with_exposures_is_said():
     assert warnings(views, [], [(view, view) for view in views]) == ""  # each view has one of its own
     assert "1 view without exposure time" in warnings([*views, plain], [], [])
     assert "does not say how long" in warnings(views, [plain], [])
-    assert "cameras bend the brightness" in warnings(views, [], [], is_bent=True)
+    assert "cameras encode the brightness" in warnings(views, [], [], is_bent=True)
     other = exposed(0.005, source="header field 'exposure time'", assumed="")
     assert "have no unit in some files" in warnings(views, [other], [])
     assert warnings([exposed(0.01), replace(exposed([0.01, 0.02]), shape=(2, 2, 2))]) == ""  # of two sizes

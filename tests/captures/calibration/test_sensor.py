@@ -199,7 +199,7 @@ def together(cubes: dict[str, np.ndarray], facts: dict[str, dict]):
     [
         (np.uint16, 3000.0, {}, "each is brought to that of the first view, 0.01"),
         (np.float32, 0.3, {}, "values are not divided by that, as they are at most about 1"),
-        (np.uint8, 90.0, {"is_srgb": True}, "which can't be undone as cameras bend the brightness"),
+        (np.uint8, 90.0, {"is_srgb": True}, "which can't be undone as cameras encode the brightness"),
     ],
 )
 def test_sensors_of_one_camera_have_one_exposure_or_it_is_said_why_not(dtype, scale, facts, said):

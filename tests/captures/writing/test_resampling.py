@@ -9,7 +9,7 @@ from PIL import Image
 from tests.captures.capture_factory import process, write_cube, write_poses
 from tests.captures.file_factory import file_of
 from unmix_plugin.captures.calibration.calibration import CalibratedRows, Calibration, Raster
-from unmix_plugin.captures.poses.lens import Lens, Points, bend_fisheye, bend_ftheta, fit_lens
+from unmix_plugin.captures.poses.lens import Lens, Points, distort_fisheye, distort_ftheta, fit_lens
 from unmix_plugin.captures.writing.resampling import Resampling
 
 WIDTH, HEIGHT = 128, 96
@@ -18,7 +18,7 @@ WIDTH, HEIGHT = 128, 96
 def fisheye(degrees: float):
     """An equidistant lens that spans so much across the picture."""
     focal = WIDTH / 2 / np.radians(degrees / 2)
-    return lambda ideal: bend_fisheye(ideal, 0.02, -0.01) * focal + (64.0, 48.0), focal
+    return lambda ideal: distort_fisheye(ideal, 0.02, -0.01) * focal + (64.0, 48.0), focal
 
 
 def radial_about_a_centre_of_its_own(ideal: Points) -> Points:
@@ -29,7 +29,7 @@ def radial_about_a_centre_of_its_own(ideal: Points) -> Points:
 
 
 def ftheta(ideal: Points) -> Points:
-    return bend_ftheta(ideal, 160.0, 0.0, 0.015, 0.0, 4e-7) / 0.015 + (62.0, 50.0)
+    return distort_ftheta(ideal, 160.0, 0.0, 0.015, 0.0, 4e-7) / 0.015 + (62.0, 50.0)
 
 
 LENSES = {

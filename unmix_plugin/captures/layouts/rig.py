@@ -287,8 +287,8 @@ def _fit_fisheye(
 
     def project(ideal: Points) -> Points:
         radius = np.hypot(*ideal.T)
-        bent = np.polynomial.polynomial.polyval(2.0 / math.pi * np.arctan(radius), polynomial)
-        ratio = np.divide(bent, radius, out=np.full_like(radius, at_axis), where=radius > 1e-9)
+        distorted = np.polynomial.polynomial.polyval(2.0 / math.pi * np.arctan(radius), polynomial)
+        ratio = np.divide(distorted, radius, out=np.full_like(radius, at_axis), where=radius > 1e-9)
         return (ideal * ratio[:, None]) @ affine.T + np.array(centre)
 
     focal = at_axis * np.diag(affine)

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from unmix_plugin.captures.poses import lens as models
-from unmix_plugin.captures.poses.lens import Lens, bent_lens
+from unmix_plugin.captures.poses.lens import Lens, distorted_lens
 from unmix_plugin.captures.poses.pose_set import (
     FLIP,
     PosedCamera,
@@ -34,28 +34,28 @@ _PLACES = ("", "sparse/", "colmap/", "colmap/sparse/", "sparse/*/", "colmap/spar
 _PLACES += tuple("*/" * depth for depth in range(1, 7))
 """Where under a folder a model is looked for, those first where COLMAP's programs put one; hloc writes
 colmap/sparse/0/models/1."""
-_MODELS: dict[str, tuple[int, models.Bend | None]] = {
+_MODELS: dict[str, tuple[int, models.Distortion | None]] = {
     "SIMPLE_PINHOLE": (3, None),
     "PINHOLE": (4, None),
     "SIMPLE_RADIAL": (4, None),
     "RADIAL": (5, None),
     "OPENCV": (8, None),
-    "OPENCV_FISHEYE": (8, models.bend_fisheye),
-    "FULL_OPENCV": (12, models.bend_opencv),
-    "FOV": (5, models.bend_fov),
-    "SIMPLE_RADIAL_FISHEYE": (4, models.bend_fisheye),
-    "RADIAL_FISHEYE": (5, models.bend_fisheye),
-    "THIN_PRISM_FISHEYE": (12, models.bend_thin_prism),
-    "RAD_TAN_THIN_PRISM_FISHEYE": (16, models.bend_fisheye_624),
-    "SIMPLE_DIVISION": (4, models.bend_division),
-    "DIVISION": (5, models.bend_division),
-    "SIMPLE_FISHEYE": (3, models.bend_fisheye),
-    "FISHEYE": (4, models.bend_fisheye),
-    "EUCM": (6, models.bend_eucm),
-    "EQUIRECTANGULAR": (2, models.bend_equirectangular),
+    "OPENCV_FISHEYE": (8, models.distort_fisheye),
+    "FULL_OPENCV": (12, models.distort_opencv),
+    "FOV": (5, models.distort_fov),
+    "SIMPLE_RADIAL_FISHEYE": (4, models.distort_fisheye),
+    "RADIAL_FISHEYE": (5, models.distort_fisheye),
+    "THIN_PRISM_FISHEYE": (12, models.distort_thin_prism),
+    "RAD_TAN_THIN_PRISM_FISHEYE": (16, models.distort_fisheye_624),
+    "SIMPLE_DIVISION": (4, models.distort_division),
+    "DIVISION": (5, models.distort_division),
+    "SIMPLE_FISHEYE": (3, models.distort_fisheye),
+    "FISHEYE": (4, models.distort_fisheye),
+    "EUCM": (6, models.distort_eucm),
+    "EQUIRECTANGULAR": (2, models.distort_equirectangular),
 }
-"""Number of parameters, and what bends ideal points where the lens is not of our kind, in the order of COLMAP's numbers
-from 0."""
+"""Number of parameters, and what distorts ideal points where the lens is not of our kind, in the order of COLMAP's
+numbers from 0."""
 _ONE_FOCAL = {name for name in _MODELS if name.startswith("SIMPLE_")} | {"RADIAL", "RADIAL_FISHEYE"}
 _CAMERA, _IMAGE, _POINT = struct.Struct("<IiQQ"), struct.Struct("<I7dI"), struct.Struct("<Q3d3BdQ")
 _OBSERVATION_BYTES, _TRACK_BYTES = 24, 8
@@ -140,11 +140,11 @@ def _lens(model: str, width: int, height: int, parameters: tuple[float, ...], wh
     fx, fy, cx, cy, *terms = (parameters[0], *parameters) if model in _ONE_FOCAL else parameters
     if min(fx, fy) <= 0:
         raise CaptureError(f"{where} has the focal length {min(fx, fy):g}; expected pixels above 0")
-    start, bend = Lens(width, height, (fx, fy), (cx, cy)), _MODELS[model][1]
-    if bend is None or (bend is models.bend_opencv and not any(terms[5:])):
+    start, distort = Lens(width, height, (fx, fy), (cx, cy)), _MODELS[model][1]
+    if distort is None or (distort is models.distort_opencv and not any(terms[5:])):
         k1, k2, p1, p2, k3 = (*terms, *[0.0] * 5)[:5]
         return replace(start, distortion=(k1, k2, p1, p2), higher_radial=(k3, 0.0))
-    return bent_lens(bend, terms, start, model, where)
+    return distorted_lens(distort, terms, start, model, where)
 
 
 def _binary_cameras(path: Path) -> dict[int, _Camera]:

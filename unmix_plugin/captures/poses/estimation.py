@@ -53,7 +53,7 @@ _MOST_FEATURES = 8192
 _SEED = 0
 _GAIN = 0.02
 """Part of the reprojection error that distortion has to remove to be kept."""
-_GREATEST_BEND = 0.1
+_MOST_DISTORTION = 0.1
 """Of half the diagonal: what distortion may move the corner of a picture by."""
 _LOG, _RESULT, _REPORT, _DRAWN = "colmap.log", "found.json", "report.txt", "worst-matches.png"
 WORK_FILES = re.compile(
@@ -370,22 +370,22 @@ def _map(pycolmap: Any, settings: dict[str, Any], database: Path, output: Path) 
     found = []
     for number, model in models.items():
         place = output / str(number)
-        bent = _with_distortion(pycolmap, model)
-        bent.write(place)
-        error = bent.compute_mean_reprojection_error()
-        found.append({"folder": str(place), "registered": bent.num_reg_images(), "error_px": error})
+        refined = _with_distortion(pycolmap, model)
+        refined.write(place)
+        error = refined.compute_mean_reprojection_error()
+        found.append({"folder": str(place), "registered": refined.num_reg_images(), "error_px": error})
     return found
 
 
 def _with_distortion(pycolmap: Any, model: Any) -> Any:
     """The model with distortion refined too, where that is better and stays small; otherwise as it was."""
-    bent = pycolmap.Reconstruction(model)
+    refined = pycolmap.Reconstruction(model)
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_extra_params, options.print_summary = True, False
-    pycolmap.bundle_adjustment(bent, options)
+    pycolmap.bundle_adjustment(refined, options)
     limit = (1.0 - _GAIN) * model.compute_mean_reprojection_error()
-    is_better = bent.compute_mean_reprojection_error() < limit
-    return bent if is_better and all(map(_is_plausible, bent.cameras.values())) else model
+    is_better = refined.compute_mean_reprojection_error() < limit
+    return refined if is_better and all(map(_is_plausible, refined.cameras.values())) else model
 
 
 def _is_plausible(camera: Any) -> bool:
@@ -393,9 +393,9 @@ def _is_plausible(camera: Any) -> bool:
     corners = np.array([[0.0, 0.0], [camera.width, 0.0], [0.0, camera.height], [camera.width, camera.height]])
     away = corners - (camera.principal_point_x, camera.principal_point_y)
     ideal = away / (camera.focal_length_x, camera.focal_length_y)
-    bent = camera.img_from_cam(np.column_stack([ideal, np.ones(4)]))
-    limit = _GREATEST_BEND * 0.5 * np.hypot(camera.width, camera.height)
-    return bool(np.isfinite(bent).all() and np.linalg.norm(bent - corners, axis=1).max() < limit)
+    distorted = camera.img_from_cam(np.column_stack([ideal, np.ones(4)]))
+    limit = _MOST_DISTORTION * 0.5 * np.hypot(camera.width, camera.height)
+    return bool(np.isfinite(distorted).all() and np.linalg.norm(distorted - corners, axis=1).max() < limit)
 
 
 if __name__ == "__main__":

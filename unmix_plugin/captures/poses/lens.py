@@ -2,8 +2,8 @@
 are replaced by one of ours: by the nearest, where that is as good as the same, otherwise by one that pictures are
 resampled into while they are written.
 
-Notation: `P` points; ideal coordinates are x/z, y/z before the camera, +x right, +y down. Models bend them, so that 1
-is one focal length; focal length and centre bring bent points to pixels.
+Notation: `P` points; ideal coordinates are x/z, y/z before the camera, +x right, +y down. Models distort them; 1 is
+one focal length; focal length and centre bring distorted points to pixels.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from unmix_plugin.limits import GREATEST_PX
 Points = Float64[np.ndarray, "P 2"]
 Project: TypeAlias = Callable[[Points], Points]
 """From ideal coordinates to pixels."""
-Bend: TypeAlias = Callable[..., Points]
-"""From ideal coordinates, and the numbers of a model, to bent ones."""
+Distortion: TypeAlias = Callable[..., Points]
+"""From ideal coordinates, and the numbers of a model, to distorted ones."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class Lens:
 
     def pixels_of(self, ideal: Points) -> Points:
         """Where ideal points are seen."""
-        return bend_brown(ideal, self.radial, self.distortion[2:]) * self.focal_px + self.center_px
+        return distort_brown(ideal, self.radial, self.distortion[2:]) * self.focal_px + self.center_px
 
     def ideal_of(self, pixels: Points) -> Points | None:
         """The inverse of `pixels_of`; None where the distortion folds."""
@@ -166,9 +166,11 @@ def fit_lens(project: Project, start: Lens, model: str, where: str) -> Lens:
     return replace(pinhole, resampled_from=project, note=note)
 
 
-def bent_lens(bend: Bend, terms: Sequence[float], start: Lens, model: str, where: str) -> Lens:
-    """The same as `fit_lens` of a model that bends ideal points, with focal length and centre of the start."""
-    return fit_lens(lambda ideal: bend(ideal, *terms) * start.focal_px + start.center_px, start, model, where)
+def distorted_lens(distort: Distortion, terms: Sequence[float], start: Lens, model: str, where: str) -> Lens:
+    """The same as `fit_lens` of a model that distorts ideal points, with focal length and centre of the start."""
+    return fit_lens(
+        lambda ideal: distort(ideal, *terms) * start.focal_px + start.center_px, start, model, where
+    )
 
 
 def _nearest_opencv(pixels: Points, ideal: Points, start: Lens) -> tuple[Lens, float]:
@@ -269,12 +271,14 @@ def _is_upright(jacobian: Float64[np.ndarray, "P 2 2"]) -> Bool[np.ndarray, " P"
 # Models of other programs: what each does to ideal points.
 
 
-def bend_brown(points: Points, radial: Sequence[float], tangential: Sequence[float] = (0.0, 0.0)) -> Points:
+def distort_brown(
+    points: Points, radial: Sequence[float], tangential: Sequence[float] = (0.0, 0.0)
+) -> Points:
     """Radial terms of r^2, r^4, ... and OpenCV's p1, p2."""
     return points * _series((points**2).sum(axis=1), radial)[:, None] + _tangential(points, tangential)
 
 
-def bend_opencv(
+def distort_opencv(
     ideal: Points, k1: float, k2: float, p1: float, p2: float, k3: float = 0.0, *below: float
 ) -> Points:
     """OpenCV's lens with three radial terms, and three more in the denominator (COLMAP's FULL_OPENCV)."""
@@ -289,13 +293,13 @@ def _equidistant(ideal: Points) -> Points:
     return ideal * _ratio(np.arctan(radius), radius)[:, None]
 
 
-def bend_fisheye(ideal: Points, *radial: float, tangential: Sequence[float] = (0.0, 0.0)) -> Points:
-    """An equidistant lens bent as OpenCV bends a perspective one: with terms of theta^2, theta^4, ... (OPENCV_FISHEYE),
-    and with tangential ones."""
-    return bend_brown(_equidistant(ideal), radial, tangential)
+def distort_fisheye(ideal: Points, *radial: float, tangential: Sequence[float] = (0.0, 0.0)) -> Points:
+    """An equidistant lens, distorted as OpenCV distorts a perspective one: with terms of theta^2, theta^4, ...
+    (OPENCV_FISHEYE), and with tangential ones."""
+    return distort_brown(_equidistant(ideal), radial, tangential)
 
 
-def bend_agisoft(
+def distort_agisoft(
     ideal: Points,
     radial: Sequence[float],
     tangential: Sequence[float],
@@ -306,29 +310,29 @@ def bend_agisoft(
     with 1 + p3 r^2 + p4 r^4."""
     points = _equidistant(ideal) if is_fisheye else ideal
     grown = _series((points**2).sum(axis=1), growth)[:, None]
-    return bend_brown(points, radial) + _tangential(points, tangential) * grown
+    return distort_brown(points, radial) + _tangential(points, tangential) * grown
 
 
-def bend_thin_prism(ideal: Points, k1: float, k2: float, p1: float, p2: float, *more: float) -> Points:
+def distort_thin_prism(ideal: Points, k1: float, k2: float, p1: float, p2: float, *more: float) -> Points:
     """COLMAP's THIN_PRISM_FISHEYE: k1, k2, p1, p2, k3, k4, sx1, sy1."""
     k3, k4, across, down = more
-    bent = bend_fisheye(ideal, k1, k2, k3, k4, tangential=(p1, p2))
-    return bent + _prism(_equidistant(ideal), (across, 0.0, down, 0.0))
+    distorted = distort_fisheye(ideal, k1, k2, k3, k4, tangential=(p1, p2))
+    return distorted + _prism(_equidistant(ideal), (across, 0.0, down, 0.0))
 
 
-def bend_fisheye_624(ideal: Points, *terms: float) -> Points:
+def distort_fisheye_624(ideal: Points, *terms: float) -> Points:
     """Project Aria's fisheye (nerfstudio's FISHEYE624, COLMAP's RAD_TAN_THIN_PRISM_FISHEYE): six radial terms, two
-    tangential and four of a thin prism, which act on bent points."""
-    bent = bend_fisheye(ideal, *terms[:6])
-    return bent + _tangential(bent, (terms[7], terms[6])) + _prism(bent, terms[8:])
+    tangential and four of a thin prism, which act on distorted points."""
+    distorted = distort_fisheye(ideal, *terms[:6])
+    return distorted + _tangential(distorted, (terms[7], terms[6])) + _prism(distorted, terms[8:])
 
 
-def bend_opensfm_624(ideal: Points, *terms: float) -> Points:
+def distort_opensfm_624(ideal: Points, *terms: float) -> Points:
     """OpenSfM's fisheye62 and fisheye624: the same terms, all of which act on the points of an equidistant lens."""
-    return bend_fisheye(ideal, *terms[:6], tangential=terms[6:8]) + _prism(_equidistant(ideal), terms[8:])
+    return distort_fisheye(ideal, *terms[:6], tangential=terms[6:8]) + _prism(_equidistant(ideal), terms[8:])
 
 
-def bend_fov(ideal: Points, omega: float) -> Points:
+def distort_fov(ideal: Points, omega: float) -> Points:
     """Source: Devernay & Faugeras 2001, Straight lines have to be straight; COLMAP's FOV."""
     radius = np.linalg.norm(ideal, axis=1)
     if abs(omega) < 1e-9:
@@ -337,25 +341,25 @@ def bend_fov(ideal: Points, omega: float) -> Points:
     return ideal * _ratio(np.arctan(radius * steep) / omega, radius, steep / omega)[:, None]
 
 
-def bend_division(ideal: Points, term: float) -> Points:
+def distort_division(ideal: Points, term: float) -> Points:
     """Source: Fitzgibbon 2001, Simultaneous linear estimation of multiple view geometry and lens distortion; NaN
     beyond the edge of the model."""
     with np.errstate(invalid="ignore"):
         return ideal * (2.0 / (1.0 + np.sqrt(1.0 - 4.0 * term * (ideal**2).sum(axis=1))))[:, None]
 
 
-def bend_eucm(ideal: Points, alpha: float, beta: float) -> Points:
+def distort_eucm(ideal: Points, alpha: float, beta: float) -> Points:
     """Source: Khomutenko et al. 2016, An enhanced unified camera model."""
     lengths = np.sqrt(beta * (ideal**2).sum(axis=1) + 1.0)
     return ideal / (alpha * lengths + 1.0 - alpha)[:, None]
 
 
-def bend_dual(ideal: Points, transition: float, *radial: float) -> Points:
+def distort_dual(ideal: Points, transition: float, *radial: float) -> Points:
     """OpenSfM's dual: between a perspective lens (1) and an equidistant one (0)."""
-    return bend_brown(transition * ideal + (1.0 - transition) * _equidistant(ideal), radial)
+    return distort_brown(transition * ideal + (1.0 - transition) * _equidistant(ideal), radial)
 
 
-def bend_ftheta(ideal: Points, reach_px: float, *terms: float) -> Points:
+def distort_ftheta(ideal: Points, reach_px: float, *terms: float) -> Points:
     """instant-ngp's ftheta: the angle from the axis is a polynomial of the distance from the centre in pixels, radians
     over pixels to the power of their number. The focal length is 1 / p1 pixels. Beyond `reach_px`, and where the
     polynomial falls, NaN."""
@@ -371,7 +375,7 @@ def bend_ftheta(ideal: Points, reach_px: float, *terms: float) -> Points:
     return ideal * _ratio(found * terms[1], radius)[:, None]
 
 
-def bend_equirectangular(ideal: Points) -> Points:
+def distort_equirectangular(ideal: Points) -> Points:
     """A picture of all directions, the axis in its middle: longitude across, latitude down, radians."""
     x, y = ideal.T
     return np.column_stack([np.arctan(x), np.arctan2(y, np.hypot(x, 1.0))])

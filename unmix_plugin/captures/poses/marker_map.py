@@ -72,7 +72,7 @@ def solve(
     same_size: bool,
     loss: str = "linear",
     steps: int = 60,
-    bent: bool = False,
+    with_distortion: bool = False,
 ) -> MarkerMap:
     """Least squares over the views and markers of the sightings, and over lenses that are free: 6 columns for each view
     and 7 for each marker (a rotation vector, a shift, the logarithm of the size), 3 for each lens (the logarithm of the
@@ -87,7 +87,7 @@ def solve(
     columns = [np.full((count[0], 6), -1), np.full((count[1], 7), -1), np.full((count[2], 3), -1)]
     columns[0][views] = 0
     columns[1][np.setdiff1d(markers, [reference]), : 6 if same_size else 7] = 0
-    columns[2][free, : 3 if bent else 1] = 0
+    columns[2][free, : 3 if with_distortion else 1] = 0
     total = 0
     for block in columns:
         block[block == 0] = np.arange(total, total + (block == 0).sum())
@@ -104,8 +104,8 @@ def solve(
         for index in np.flatnonzero(free):
             lens, (zoom, k1, k2) = lenses[index], step[2][index].tolist()
             x, y = (focal * float(np.exp(zoom)) for focal in lens.focal_px)
-            bend = (lens.distortion[0] + k1, lens.distortion[1] + k2, *lens.distortion[2:])
-            lenses[index] = replace(lens, focal_px=(x, y), distortion=bend)
+            distortion = (lens.distortion[0] + k1, lens.distortion[1] + k2, *lens.distortion[2:])
+            lenses[index] = replace(lens, focal_px=(x, y), distortion=distortion)
         return MarkerMap(cameras, placed, found.sizes * np.exp(step[1][:, 6]), tuple(lenses))
 
     where = [columns[0][seen.view], columns[1][seen.marker], columns[2][seen.sensor[seen.view]]]

@@ -283,9 +283,9 @@ def _with_distortion(found: MarkerMap, seen: Seen, free: Bool[np.ndarray, " L"])
     """The map with k1 and k2 estimated too, where that is better."""
     if not free.any():
         return found
-    bent = solve(found, seen, free, same_size=True, bent=True)
-    before, after = (float(np.sqrt(np.mean(one.misses(seen) ** 2))) for one in (found, bent))
-    return bent if after < (1.0 - _GAIN) * before else found
+    distorted = solve(found, seen, free, same_size=True, with_distortion=True)
+    before, after = (float(np.sqrt(np.mean(one.misses(seen) ** 2))) for one in (found, distorted))
+    return distorted if after < (1.0 - _GAIN) * before else found
 
 
 # What is refused, and the result.
@@ -324,7 +324,7 @@ def _refuse_moved(found: MarkerMap, seen: Seen, kept: Bool[np.ndarray, " S"]) ->
         )
     raise CaptureError(
         f"markers did not keep their places: {found_is}; expected boards that are fixed to the object: cover those "
-        "that are not. If none moved, the lens bends more than k1 and k2 can say"
+        "that are not. If none moved, the lens is distorted by more than k1 and k2 describe"
     )
 
 

@@ -3,8 +3,8 @@
 A camera's matrix leads from the camera (OpenCV axes) to its component; the component's or the chunk's similarity leads
 to the world, often geocentric (metres from the middle of the Earth).
 
-A sensor's lens: u = w / 2 + cx + x' f + x' b1 + y' b2, v = h / 2 + cy + y' f, with x', y' bent by k1..k4 and by p1, p2,
-which are OpenCV's p2, p1. PhotoScan up to 1.3 wrote fx and fy in place of f, which is refused by name.
+A sensor's lens: u = w / 2 + cx + x' f + x' b1 + y' b2, v = h / 2 + cy + y' f, with x', y' distorted by k1..k4 and by
+p1, p2, which are OpenCV's p2, p1. PhotoScan up to 1.3 wrote fx and fy in place of f, which is refused by name.
 
 Of a system of several cameras the master alone has a matrix. Another has the master's times what its sensor says once,
 [rotation | location]: from its own axes to the master's, and where it stands in these, in the component's units.
@@ -29,9 +29,9 @@ from jaxtyping import Float64
 from unmix_plugin.captures.poses.lens import (
     Lens,
     Points,
-    bend_agisoft,
-    bend_equirectangular,
-    bent_lens,
+    distort_agisoft,
+    distort_equirectangular,
+    distorted_lens,
     fit_lens,
 )
 from unmix_plugin.captures.poses.pose_set import (
@@ -236,7 +236,9 @@ def _lens_metashape(sensor: _Element, where: str, notes: list[str]) -> Lens | No
         raise CaptureError(f"{where} is of the type {kind}; expected frame, fisheye or spherical")
     if kind == "spherical":
         start = Lens(width, height, (width / (2 * np.pi), height / np.pi), (width / 2, height / 2))
-        return bent_lens(bend_equirectangular, (), start, f"Metashape spherical of sensor {name}", where)
+        return distorted_lens(
+            distort_equirectangular, (), start, f"Metashape spherical of sensor {name}", where
+        )
     if calibration is None:
         notes.append(f"sensor {name} is not calibrated: nominal focal length")
         calibration = _nominal_calibration(sensor)
@@ -266,13 +268,13 @@ def _lens_metashape(sensor: _Element, where: str, notes: list[str]) -> Lens | No
     if kind == "frame" and not any(more.values()):
         return frame
 
-    def bent_and_skewed(ideal: Points) -> Points:
-        bent = bend_agisoft(ideal, frame.radial, tangential, growth, is_fisheye=kind == "fisheye")
-        return bent @ np.array([[f_x, 0.0], [skew, f_y]]) + start.center_px
+    def distorted_and_skewed(ideal: Points) -> Points:
+        distorted = distort_agisoft(ideal, frame.radial, tangential, growth, is_fisheye=kind == "fisheye")
+        return distorted @ np.array([[f_x, 0.0], [skew, f_y]]) + start.center_px
 
     terms = " and ".join(term for term, is_there in more.items() if is_there)
     model = "fisheye" if kind == "fisheye" else f"with {terms}"
-    return fit_lens(bent_and_skewed, start, f"Metashape {model} of sensor {name}", where)
+    return fit_lens(distorted_and_skewed, start, f"Metashape {model} of sensor {name}", where)
 
 
 def _unknown_terms(calibration: _Element, name: str) -> list[str]:

@@ -14,7 +14,7 @@ from xml.etree import ElementTree
 import numpy as np
 from jaxtyping import Float64
 
-from unmix_plugin.captures.poses.lens import Lens, Points, bend_brown, fit_lens
+from unmix_plugin.captures.poses.lens import Lens, Points, distort_brown, fit_lens
 from unmix_plugin.captures.poses.pose_set import (
     FLIP,
     PosedCamera,
@@ -150,25 +150,25 @@ def _calibration_micmac(inner: _Element, where: str) -> Lens:
         raise CaptureError(f"{where}: <PP>, <F> or <SzIm> are missing or not above 0")
     width, height = (int(side) for side in size)
     start = Lens(width, height, (focal, focal), (float(center[0]) + 0.5, float(center[1]) + 0.5))
-    bends = [model for model in inner.iterfind("CalibDistortion/*") if model.tag != "ModNoDist"]
-    unknown = [model.tag for model in bends if model.tag not in ("ModRad", "ModPhgrStd")]
+    distortions = [model for model in inner.iterfind("CalibDistortion/*") if model.tag != "ModNoDist"]
+    unknown = [model.tag for model in distortions if model.tag not in ("ModRad", "ModPhgrStd")]
     if unknown:
         raise CaptureError(
             f"{where}: the distortion {unknown[0]} is not supported; calibrate with RadialStd or Fraser, or use Drunk"
         )
-    if not bends:
+    if not distortions:
         return start
 
     def project(ideal: Points) -> Points:
         pixels = focal * ideal + center
-        for model in reversed(bends):
-            pixels = _bend(pixels, model, where)
+        for model in reversed(distortions):
+            pixels = _distort(pixels, model, where)
         return pixels + 0.5
 
-    return fit_lens(project, start, " and ".join(model.tag for model in bends), where)
+    return fit_lens(project, start, " and ".join(model.tag for model in distortions), where)
 
 
-def _bend(pixels: Points, model: _Element, where: str) -> Points:
+def _distort(pixels: Points, model: _Element, where: str) -> Points:
     """ModRad: radial terms of r^2, r^4, ... about a centre; ModPhgrStd adds P1, P2, b1, b2."""
     radial = model if model.tag == "ModRad" else model.find("RadiaPart")
     middle = None if radial is None else numbers_in(radial.find("CDist"), 2, where)
@@ -178,4 +178,4 @@ def _bend(pixels: Points, model: _Element, where: str) -> Points:
     terms = [0.0 if term is None else float(term[0]) for term in found]
     p1, p2, b1, b2 = (number_in(model, tag, where) for tag in ("P1", "P2", "b1", "b2"))
     away = pixels - middle
-    return bend_brown(away, terms, (p2, p1)) + away @ np.array([[b1, 0.0], [b2, 0.0]]) + middle
+    return distort_brown(away, terms, (p2, p1)) + away @ np.array([[b1, 0.0], [b2, 0.0]]) + middle

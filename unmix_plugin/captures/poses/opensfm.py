@@ -19,16 +19,16 @@ from unmix_plugin.formats.json_values import describe, read_number, read_numbers
 
 _PLAIN = ("perspective", "simple_radial", "radial", "brown")
 _SIX_TERMS = "k1 k2 k3 k4 k5 k6 p1 p2 s0 s1 s2 s3"
-_BENT: dict[str, tuple[lens.Bend, str]] = {
-    "fisheye": (lens.bend_fisheye, "k1 k2 k3 k4"),
-    "fisheye_opencv": (lens.bend_fisheye, "k1 k2 k3 k4"),
-    "fisheye62": (lens.bend_opensfm_624, _SIX_TERMS),
-    "fisheye624": (lens.bend_opensfm_624, _SIX_TERMS),
-    "dual": (lens.bend_dual, "transition k1 k2"),
-    "spherical": (lens.bend_equirectangular, ""),
-    "equirectangular": (lens.bend_equirectangular, ""),
+_DISTORTED: dict[str, tuple[lens.Distortion, str]] = {
+    "fisheye": (lens.distort_fisheye, "k1 k2 k3 k4"),
+    "fisheye_opencv": (lens.distort_fisheye, "k1 k2 k3 k4"),
+    "fisheye62": (lens.distort_opensfm_624, _SIX_TERMS),
+    "fisheye624": (lens.distort_opensfm_624, _SIX_TERMS),
+    "dual": (lens.distort_dual, "transition k1 k2"),
+    "spherical": (lens.distort_equirectangular, ""),
+    "equirectangular": (lens.distort_equirectangular, ""),
 }
-"""Types of projection that are not ours: what bends ideal points, and its numbers."""
+"""Types of projection that are not ours: what distorts ideal points, and its numbers."""
 
 
 def read_opensfm(path: Path, content: Any) -> PoseSet:
@@ -109,22 +109,24 @@ def _lens_opensfm(values: dict[str, Any], where: str) -> lens.Lens:
 
     width, height = int(number("width")), int(number("height"))
     kind = values.get("projection_type", "perspective")
-    bend, keys = _BENT.get(kind, (None, "")) if isinstance(kind, str) else (None, "")
-    usual = 1 / (2 * np.pi) if bend is lens.bend_equirectangular else 0.0
+    distort, keys = _DISTORTED.get(kind, (None, "")) if isinstance(kind, str) else (None, "")
+    usual = 1 / (2 * np.pi) if distort is lens.distort_equirectangular else 0.0
     focal = number("focal_x", number("focal", usual))
     focal = focal, number("focal_y", focal)
     if not (0 < width < 1e6 and 0 < height < 1e6) or min(focal) <= 0:
         raise CaptureError(f"{where}: width, height or focal length is missing or not above 0")
-    if bend is None and kind not in _PLAIN:
-        raise CaptureError(f"{where} is {describe(kind)}; expected one of {', '.join((*_PLAIN, *_BENT))}")
+    if distort is None and kind not in _PLAIN:
+        raise CaptureError(
+            f"{where} is {describe(kind)}; expected one of {', '.join((*_PLAIN, *_DISTORTED))}"
+        )
     side = max(width, height)
     center = (width / 2 + side * number("c_x"), height / 2 + side * number("c_y"))
     start = lens.Lens(width, height, (side * focal[0], side * focal[1]), center)
-    if bend is None:
+    if distort is None:
         k1, k2, k3, p1, p2 = map(number, ("k1", "k2", "k3", "p1", "p2"))
         return replace(start, distortion=(k1, k2, p1, p2), higher_radial=(k3, 0.0))
     terms = [number(key, 1.0 if key == "transition" else 0.0) for key in keys.split()]
-    return lens.bent_lens(bend, terms, start, kind, where)
+    return lens.distorted_lens(distort, terms, start, kind, where)
 
 
 def _points(content: dict[str, Any], where: str) -> SparsePoints | None:

@@ -18,7 +18,7 @@ from jaxtyping import Float64
 from unmix_plugin.captures.names import BY_ORDER, path_text, size_of_view
 from unmix_plugin.captures.poses import lens as models
 from unmix_plugin.captures.poses.colmap import find_models, is_model, read_colmap
-from unmix_plugin.captures.poses.lens import Lens, bent_lens
+from unmix_plugin.captures.poses.lens import Lens, distorted_lens
 from unmix_plugin.captures.poses.metashape import read_metashape
 from unmix_plugin.captures.poses.micmac import find_orientations, read_micmac
 from unmix_plugin.captures.poses.opensfm import read_opensfm
@@ -196,10 +196,10 @@ def _read_llff(path: Path) -> PoseSet:
 _NAME_KEYS = ("file_path", "hyperspectral_file_path", "name")
 """Of a frame: the first that is there names its image."""
 _PLAIN_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")
-_BENT_MODELS: dict[str, models.Bend] = {
-    "OPENCV_FISHEYE": models.bend_fisheye,
-    "FISHEYE624": models.bend_fisheye_624,
-    "EQUIRECTANGULAR": models.bend_equirectangular,
+_DISTORTED_MODELS: dict[str, models.Distortion] = {
+    "OPENCV_FISHEYE": models.distort_fisheye,
+    "FISHEYE624": models.distort_fisheye_624,
+    "EQUIRECTANGULAR": models.distort_equirectangular,
 }
 
 
@@ -341,24 +341,28 @@ def _make_lens(
     x, y = given.center_px
     center, focal = (width / 2 if x is None else x, height / 2 if y is None else y), given.focal_at(*size)
     model = other_model or given.model
-    bend: models.Bend | None = _BENT_MODELS.get(model) if isinstance(model, str) else None
+    distort: models.Distortion | None = _DISTORTED_MODELS.get(model) if isinstance(model, str) else None
     if model == "ftheta":  # by its terms alone, never by `camera_model`
-        bend, focal, terms = models.bend_ftheta, (1.0 / terms[1], 1.0 / terms[1]), (math.hypot(*size), *terms)
-    elif bend is models.bend_equirectangular:
+        distort, focal, terms = (
+            models.distort_ftheta,
+            (1.0 / terms[1], 1.0 / terms[1]),
+            (math.hypot(*size), *terms),
+        )
+    elif distort is models.distort_equirectangular:
         focal = (width / (2 * math.pi), height / math.pi)
-    elif bend is models.bend_fisheye:
-        bend = partial(models.bend_fisheye, tangential=given.distortion[2:])
+    elif distort is models.distort_fisheye:
+        distort = partial(models.distort_fisheye, tangential=given.distortion[2:])
         terms = (*given.distortion[:2], *given.higher_radial)
     if focal is None:
         return None
     if model in _PLAIN_MODELS:
         return Lens(*size, focal, center, given.distortion, given.higher_radial)
-    if bend is None:
+    if distort is None:
         raise CaptureError(
             f"{where}: camera_model {describe(model)} is not known; expected one of "
-            f"{', '.join((*_PLAIN_MODELS, *_BENT_MODELS))}: undistort the images first"
+            f"{', '.join((*_PLAIN_MODELS, *_DISTORTED_MODELS))}: undistort the images first"
         )
-    return bent_lens(bend, terms, Lens(*size, focal, center), model, where)
+    return distorted_lens(distort, terms, Lens(*size, focal, center), model, where)
 
 
 def _read_matrix(value: Any, where: str) -> Float64[np.ndarray, "3 4"]:

@@ -49,7 +49,7 @@ _ENOUGH_MATCHES, _ENOUGH_FIT = 300, 0.5
 alone."""
 _NOT_COMPARED_PX = 2.0
 """What outlines count that can't be compared in the pose that is tried."""
-_GREATEST_BEND = 0.1
+_MOST_DISTORTION = 0.1
 """Of half the diagonal: what distortion may move the corner of a picture by."""
 _PITCH, _AZIMUTH = 1, 4
 """Columns of a place of the camera."""
@@ -129,10 +129,10 @@ class _Numbers:
         self, pixels: Float64[np.ndarray, "*n 2"], size: tuple[int, int]
     ) -> Float64[np.ndarray, "*n 3"]:
         """Directions of pixels before the camera, 1 forward."""
-        bent = (pixels - np.array(size) / 2) / self.focal_px
-        ideal = bent
+        distorted = (pixels - np.array(size) / 2) / self.focal_px
+        ideal = distorted
         for _ in range(4 if self.k1 else 0):
-            ideal = bent / (1.0 + self.k1 * (ideal**2).sum(axis=-1, keepdims=True))
+            ideal = distorted / (1.0 + self.k1 * (ideal**2).sum(axis=-1, keepdims=True))
         return np.concatenate([ideal, np.ones((*ideal.shape[:-1], 1))], axis=-1)
 
     def errors(
@@ -262,26 +262,26 @@ def _solve(
     which: Sequence[int],
     steps: int,
     zoom: bool = True,
-    bent: bool = False,
+    distorted: bool = False,
     slack: bool = False,
 ) -> _Numbers:
     """Least squares over some places of the camera, the first of which holds the world in place; and over the focal
-    length (zoom), k1 (bent) and the angles (slack) where asked."""
+    length (zoom), k1 (distorted) and the angles (slack) where asked."""
     from scipy.optimize import least_squares
 
     free = np.zeros(start.cameras.shape, bool)
     free[list(which)] = True
     free[which[0], 3:] = False
-    few = int(zoom) + int(bent) + int(free.sum())
-    size = np.concatenate([[0.1] * (int(zoom) + int(bent)), np.full(free.sum(), 0.05)])
+    few = int(zoom) + int(distorted) + int(free.sum())
+    size = np.concatenate([[0.1] * (int(zoom) + int(distorted)), np.full(free.sum(), 0.05)])
     views = len(start.slack) if slack else 0
 
     def numbers_of(values: np.ndarray) -> _Numbers:
         cameras, angles = start.cameras.copy(), start.slack.copy()
-        cameras[free] += values[int(zoom) + int(bent) : few]
+        cameras[free] += values[int(zoom) + int(distorted) : few]
         angles[: len(values) - few] += values[few:]
         focal = start.focal_px * float(np.exp(values[0])) if zoom else start.focal_px
-        k1 = start.k1 + (float(values[int(zoom)]) if bent else 0.0)
+        k1 = start.k1 + (float(values[int(zoom)]) if distorted else 0.0)
         return replace(start, focal_px=focal, cameras=cameras, slack=angles, k1=k1)
 
     def flat(numbers: _Numbers, **changes: Any) -> np.ndarray:
@@ -341,12 +341,12 @@ def _fit(evidence: Evidence) -> _Numbers:
         none = evidence.first[:0]
         # On plain things most matches are chance, such as highlights, and would pull the cameras with them.
         return _fit(replace(evidence, first=none, second=none, points=evidence.points[:0]))
-    bent = _solve(best, fine, everyone, steps=20, bent=True)
+    distorted = _solve(best, fine, everyone, steps=20, distorted=True)
     # By how much of half the diagonal distortion moves the corners of a picture.
-    moved = abs(bent.k1) * (np.hypot(*evidence.size) / 2 / bent.focal_px) ** 2
-    if bent.cost(fine) < (1.0 - _GAIN) * best.cost(fine) and moved < _GREATEST_BEND:
-        best = bent
-    loose = _solve(best, fine, everyone, steps=20, bent=bool(best.k1), slack=True)
+    moved = abs(distorted.k1) * (np.hypot(*evidence.size) / 2 / distorted.focal_px) ** 2
+    if distorted.cost(fine) < (1.0 - _GAIN) * best.cost(fine) and moved < _MOST_DISTORTION:
+        best = distorted
+    loose = _solve(best, fine, everyone, steps=20, distorted=bool(best.k1), slack=True)
     return loose if loose.cost(fine) < (1.0 - _SLACK_GAIN) * best.cost(fine) else best
 
 
