@@ -163,8 +163,8 @@ def make_folders(place: Path) -> dict[str, tuple[str, ...]]:
     data_sets.write_nespof(add("nespof", "nespof"))
     data_sets.write_real(add("nespof-real", "nespof-real"))
     data_sets.write_unmix(add("unmix-nerf", "unmix-nerf"))
-    rig_flight.write_flight(add("rig", "rig", "--poses", "IN/poses.json", "--mask", "none"), releases=3)
-    rig_flight.write_poses(place / "rig" / "poses.json", releases=3)
+    rig_flight.write_flight(add("rig", "rig", "--poses", "IN/poses.json", "--mask", "none"), shots=3)
+    rig_flight.write_poses(place / "rig" / "poses.json", shots=3)
     shutil.copytree(small_run(place / "training").run, place / "run")
     return words
 

@@ -274,7 +274,7 @@ def main(options: Options) -> None:
             direct, resampled = (
                 _psnr(folder / which, steps, folder / "runs" / which) for which in ("direct", "resampled")
             )
-        moved = fit_lens(project, Lens(WIDTH, HEIGHT, (60.0, 60.0), _CENTER), name, "").said
+        moved = fit_lens(project, Lens(WIDTH, HEIGHT, (60.0, 60.0), _CENTER), name, "").note
         measured[name] = {
             "points_off_px": off_px,
             "direct_db": direct,

@@ -29,12 +29,12 @@ from unmix_plugin.spectral.colour.srgb import decode_srgb
 GENERATOR = np.random.default_rng(0)
 
 
-@pytest.mark.parametrize(("kind", "level", "matter"), [("black", 0.03, 0.12), ("white", 0.95, 0.8)])
-def test_the_threshold_lies_beyond_the_noise_of_the_border(kind, level: float, matter: float):
+@pytest.mark.parametrize(("kind", "level", "foreground"), [("black", 0.03, 0.12), ("white", 0.95, 0.8)])
+def test_the_threshold_lies_beyond_the_noise_of_the_border(kind, level: float, foreground: float):
     border = level + 0.01 * GENERATOR.standard_normal((5000, 8)).astype(np.float32)
     rule = background_rule(kind, border, np.ones((500, 8), np.float32))
-    assert rule.matter(border[None]).mean() < 1e-3
-    assert rule.matter(np.full((1, 10, 8), matter, np.float32)).all()
+    assert rule.foreground(border[None]).mean() < 1e-3
+    assert rule.foreground(np.full((1, 10, 8), foreground, np.float32)).all()
     with pytest.raises(CaptureError, match=f"--mask {kind}: the border of the views is at 40%"):
         background_rule(kind, np.full((100, 8), 0.4, np.float32), np.ones((9, 8), np.float32))
 
@@ -43,7 +43,7 @@ def test_a_white_background_is_bright_in_every_band():
     rule = background_rule("white", *2 * [np.full((100, 8), 0.98, np.float32)])
     leaf = np.full((1, 1, 8), 0.98, np.float32)
     leaf[..., 3] = 0.4
-    assert rule.matter(leaf).all()
+    assert rule.foreground(leaf).all()
 
 
 def test_large_holes_and_parts_stay():
@@ -118,7 +118,7 @@ def test_a_folder_of_pictures_has_the_opacity_of_the_picture_beside_it_if_there_
     assert masks.straight is None
 
 
-def test_a_scene_without_any_matter_is_refused(tmp_path):
+def test_a_scene_without_any_foreground_is_refused(tmp_path):
     made = make_capture(tmp_path / "capture")
     for name in made.reflectance:
         pixels = np.zeros((HEIGHT, WIDTH, 4), np.uint8)
@@ -129,7 +129,7 @@ def test_a_scene_without_any_matter_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize(("first", "share"), [(5, 0.0), (2, 0.5)])
-def test_pixels_without_a_measurement_are_no_share_of_the_matter(tmp_path, first, share):
+def test_pixels_without_a_measurement_are_no_share_of_the_foreground(tmp_path, first, share):
     values = np.full((4, 5, 2), 0.5, np.float32)
     values[:, 4] = np.nan
     mask = np.tile(np.arange(5) >= first, (4, 1)).astype(np.uint8)

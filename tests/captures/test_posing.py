@@ -128,9 +128,9 @@ def test_lenses_that_were_scaled_to_their_pictures_are_said(width, height, note,
     assert [finding in text for text in sentences(posed.remarks, Kind.WRONG)] == [True] * bool(finding)
 
 
-def rig_view(release: str, sensor: str, angles: str | None = None) -> CaptureView:
+def rig_view(shot: str, sensor: str, angles: str | None = None) -> CaptureView:
     cube = cube_of(3, 4, **({} if angles is None else {"Camera:RigRelatives": angles}))
-    return CaptureView(f"{release}{sensor}", cube, sensor, lens=SMALL_LENS, shot=release)
+    return CaptureView(f"{shot}{sensor}", cube, sensor, lens=SMALL_LENS, shot=shot)
 
 
 def turned_camera(seed: int) -> PosedCamera:
@@ -158,18 +158,18 @@ def test_offsets_and_lenses_that_were_found_go_before_those_in_the_files():
     offset, lens = np.eye(4), replace(SMALL_LENS, focal_px=(6.0, 6.0))
     offset[:3, :3] = Rotation.from_euler("xyz", [1, 2, 3], degrees=True).as_matrix()
     offset[:3, 3] = (0.1, -0.2, 0.3)
-    releases = ("r1", "r2", "r3")
-    views = [rig_view(release, sensor, ANGLES[sensor]) for release in releases for sensor in "ab"]
-    posed = {f"{release}a": turned_camera(index) for index, release in enumerate(releases, start=1)}
+    shots = ("r1", "r2", "r3")
+    views = [rig_view(shot, sensor, ANGLES[sensor]) for shot in shots for sensor in "ab"]
+    posed = {f"{shot}a": turned_camera(index) for index, shot in enumerate(shots, start=1)}
     moved = {name[:2]: np.vstack([one.camera_to_world, [0, 0, 0, 1]]) @ offset for name, one in posed.items()}
-    posed |= {f"{release}b": PosedCamera(moved[release][:3], lens) for release in releases[:2]}
+    posed |= {f"{shot}b": PosedCamera(moved[shot][:3], lens) for shot in shots[:2]}
     completed, (note,) = complete_rigs(views, posed)
     np.testing.assert_allclose(completed["r3b"].camera_to_world, moved["r3"][:3], atol=1e-12)
     assert completed["r3b"].lens == lens
-    assert (note.code, note.values["lens"]) == (Code.RIG_AS_OTHER_RELEASES, "b")
+    assert (note.code, note.values["lens"]) == (Code.RIG_AS_OTHER_SHOTS, "b")
 
 
-def test_views_without_any_help_are_left_out_and_said_and_those_of_no_release_left_alone():
+def test_views_without_any_help_are_left_out_and_said_and_those_of_no_shot_left_alone():
     views = [rig_view("r1", "a"), rig_view("r1", "b"), *(rig_view("r2", x, ANGLES[x]) for x in "ab")]
     completed, notes = complete_rigs(views, {"r1a": turned_camera(1)})
     assert set(completed) == {"r1a"}

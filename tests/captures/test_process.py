@@ -494,7 +494,7 @@ def test_a_backdrop_is_cut_out_also_where_nobody_named_it(tmp_path: Path, mask):
         np.testing.assert_allclose(scene.cube(index)[BRIGHT_SQUARE], expected, atol=0.02)
     if mask == "auto":
         report = (tmp_path / "scene" / "report.txt").read_text()
-        assert "backdrop found, black (0.020): 25% of the pixels are matter" in report
+        assert "backdrop found, black (0.020): 25% of the pixels are foreground" in report
         decisions = record_of(tmp_path / "scene")["decisions"]
         assert decisions["mask"] == "auto"
         assert decisions["sensors"]["all views"]["background"]["kind"] == "found"
@@ -507,4 +507,4 @@ def test_without_a_backdrop_all_of_each_image_is_the_scene(tmp_path: Path, captu
         write_cube(capture.root, name, counts.astype(np.uint16))
     assert not made(tmp_path, capture, mask="auto")[0].has_alpha
     report = " ".join((tmp_path / "scene" / "report.txt").read_text().split())
-    assert "no mask of matter: all of each image belongs to the scene" in report
+    assert "no mask of the foreground: all of each image belongs to the scene" in report

@@ -244,7 +244,7 @@ def is_below_black(sample: Float32[np.ndarray, "N c"]) -> bool:
 def choose_mask(
     asked: MaskKind, views: Sequence[str], without: Sequence[str], is_rig: bool
 ) -> tuple[MaskKind, list[Remark]]:
-    """What tells matter from background, `auto` where files don't, and what a user should know of it.
+    """What tells foreground from background, `auto` where files don't, and what a user should know of it.
 
     Args:
         views: Names of all views.
@@ -261,7 +261,7 @@ def choose_mask(
     if asked == "files":
         raise CaptureError(
             f"--mask files: view {without[0]} has no mask; expected an alpha channel, or a mask that is white where "
-            "matter is, for every view"
+            "the foreground is, for every view"
         )
     otherwise: MaskKind = "none" if is_rig else "auto"
     if len(without) == len(views):

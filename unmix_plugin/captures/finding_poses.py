@@ -111,7 +111,7 @@ def _in_files(plan: Plan, poses: PoseSet) -> PoseSet:
 
 
 def _shown(scene: Path, record: ViewRecord) -> Bool[np.ndarray, "H W"]:
-    """Pixels of matter that were measured."""
+    """Pixels of the foreground that were measured."""
     from PIL import Image
 
     with Image.open(scene / record.paths["file_path"]) as picture:

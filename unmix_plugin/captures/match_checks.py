@@ -309,10 +309,10 @@ def _features_of(picture: Path) -> tuple[Points, np.ndarray] | None:
         size = (max(1, round(opened.width * shrunk)), max(1, round(opened.height * shrunk)))
         whole, opacity = opened.convert("L"), opened.convert("RGBA").getchannel("A")
         grey = np.asarray(whole.resize(size, Image.Resampling.BOX), np.float64) / 255
-        matter = np.asarray(opacity.resize(size, Image.Resampling.BOX)) > 127
+        foreground = np.asarray(opacity.resize(size, Image.Resampling.BOX)) > 127
     sift = SIFT(upsampling=2 if max(size) < _LONGEST_SIDE_PX else 1)
     try:
-        sift.detect_and_extract(np.where(matter, grey, 0.0))
+        sift.detect_and_extract(np.where(foreground, grey, 0.0))
     except (RuntimeError, ValueError, IndexError):  # nothing stands out, or the view is too small
         return None
     places = np.asarray(sift.keypoints, np.float64)[:, ::-1]

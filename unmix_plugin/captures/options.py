@@ -31,7 +31,7 @@ LAYOUTS = tuple(_LAYOUTS)
 GONE_LAYOUTS = {
     "hs-nerf": "save its .pt tensors as .npy (numpy.save), name these in transforms.json and take the layout unmix-nerf"
 }
-"""Layouts that earlier releases had, and what to do."""
+"""Layouts that earlier versions had, and what to do."""
 
 FROM_PICTURES = ESTIMATE, MARKERS, TURNTABLE = "estimate", "markers", "turntable"
 """Words of --poses that ask to find poses instead of reading them."""
@@ -85,12 +85,12 @@ class ProcessOptions:
     white_rectangle: Annotated[
         tuple[str, int, int, int, int] | None, tyro.conf.arg(metavar="VIEW ROW COLUMN HEIGHT WIDTH")
     ] = None
-    """The white reference is a panel in a view, or in the views of a release of a rig: its first row and column, height
+    """The white reference is a panel in a view, or in the views of a shot of a rig: its first row and column, height
     and width in pixels."""
     white_reflectance: str = "1"
     """Reflectance of the white panel: a number, or a CSV file (wavelength,reflectance)."""
     mask: MaskKind = "auto"
-    """What separates matter from background: pictures of the capture (files), a white or a black background, or
+    """What separates foreground from background: pictures of the capture (files), a white or a black background, or
     nothing (none); auto takes the alpha channel of the capture's pictures where they have one, otherwise a plain
     backdrop that all views show, if there is one."""
     drop_bands: str | None = None

@@ -208,7 +208,7 @@ def complete_rigs(
                 completed[view.name] = PosedCamera(pose[:3], lenses.get(view.sensor) or view.lens)
             code = Code.RIG_OFFSET_UNKNOWN if posed else Code.RIG_WITHOUT_POSE
             code = Code.RIG_AS_FILES_SAY if by_files else code
-            how[view.sensor, Code.RIG_AS_OTHER_RELEASES if by_poses else code] += 1
+            how[view.sensor, Code.RIG_AS_OTHER_SHOTS if by_poses else code] += 1
     return completed, [Remark.of(code, views=n, lens=sensor) for (sensor, code), n in how.items()]
 
 

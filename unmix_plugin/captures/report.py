@@ -213,15 +213,15 @@ class Code(Enum):
         "{unposed} of {views} views have no pose and are left out ({names}): is {source} the whole model, and are the "
         "names in it those of the files?"
     )
-    RIG_WITHOUT_POSE = _done("{views:view} of lens {lens} left out: no lens of their release has a pose")
+    RIG_WITHOUT_POSE = _done("{views:view} of lens {lens} left out: no lens of their shot has a pose")
     RIG_OFFSET_UNKNOWN = _done(
         "{views:view} of lens {lens} left out: there is no pose, and nothing says where the lens is on the rig"
     )
-    RIG_AS_OTHER_RELEASES = _done(
-        "{views:view} of lens {lens} got the pose of another lens of their release, moved as in other releases"
+    RIG_AS_OTHER_SHOTS = _done(
+        "{views:view} of lens {lens} got the pose of another lens of their shot, moved as in other shots"
     )
     RIG_AS_FILES_SAY = _done(
-        "{views:view} of lens {lens} got the pose of another lens of their release, turned as the files say, at the "
+        "{views:view} of lens {lens} got the pose of another lens of their shot, turned as the files say, at the "
         "same place"
     )
     LENS_OF_SENSOR = _done("lens {lens}: {text}")

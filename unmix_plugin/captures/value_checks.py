@@ -9,8 +9,8 @@ origin, and the flat in which they vary contains the origin. If a level is added
 *Bands.* A band that differs from its neighbours by the same factor in dark and bright pixels of all materials has a
 gain of its own; what a material does to one band, it does to its own pixels only.
 
-*Masks.* If what the masks call matter is black and what they call background has light and texture, they are the wrong
-way round. A mask that covers far more or less than those of near views is suspect.
+*Masks.* If what the masks call foreground is black and what they call background has light and texture, they are the
+wrong way round. A mask that covers far more or less than those of near views is suspect.
 
 Notation: `N` views, `P` pixels of one view, `B` bands; values in [0, 1] as they are written.
 """
@@ -61,9 +61,10 @@ _GAP = 3.0
 _MOST_ODD = 5
 """Bands of which each may have a gain of its own."""
 _BLACK_SHARE, _TEXTURE = 0.1, 0.3
-"""Brightness of matter over that of the background, and spread of the background, from which masks are inverted."""
+"""Brightness of the foreground over that of the background, and spread of the background, from which masks are
+inverted."""
 _FILLED = 0.9
-"""Share of the border that is matter, and of the middle that is none, from which they may be."""
+"""Share of the border that is foreground, and of the middle that is none, from which they may be."""
 _OTHER_COVER = 0.3
 """Share of a view by which its mask may differ from those of near views."""
 
@@ -91,12 +92,12 @@ def check_files(views: Sequence[CaptureView], options: ProcessOptions) -> list[R
 
 @dataclass(frozen=True)
 class ViewSample:
-    """Some pixels of a view that show matter and are measured."""
+    """Some pixels of a view that show foreground and are measured."""
 
     record: ViewRecord
     spectra: Float32[np.ndarray, "P B"]
     is_hollow: bool = False
-    """Whether matter fills the border of the picture and leaves out its middle."""
+    """Whether the foreground fills the border of the picture and leaves out its middle."""
 
     @staticmethod
     def of(record: ViewRecord, scene: Path) -> ViewSample:

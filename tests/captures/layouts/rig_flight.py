@@ -130,20 +130,20 @@ def file_name(index: int, lens: LensOfRig) -> str:
     return f"IMG_170101_1010{index:02d}_{index:04d}_{lens.ending}.TIF"
 
 
-def write_flight(root: Path, releases: int = 10) -> None:
+def write_flight(root: Path, shots: int = 10) -> None:
     """Files of all lenses; EXIF says that they are turned, which must be ignored."""
-    for index in range(releases):
+    for index in range(shots):
         for lens in LENSES:
             exif, counts = EXIF | {"ExposureTime": lens.exposure_s}, stored(image(index, lens), lens)
             write_band_file(root / file_name(index, lens), counts, tags(index, lens), exif, orientation=3)
 
 
 PANEL_LIGHT = {"GRE": 0.5, "RED": 0.4, "REG": 0.7, "NIR": 0.62}
-"""Radiance of a grey panel that fills the images of one release."""
+"""Radiance of a grey panel that fills the images of one shot."""
 
 
 def write_panel(root: Path) -> str:
-    """Files of a release that shows the panel, before the flight; gives its name."""
+    """Files of a shot that shows the panel, before the flight; gives its name."""
     for lens in LENSES:
         light = np.full((HEIGHT, WIDTH), PANEL_LIGHT[lens.ending])
         path = root / f"IMG_170101_100000_9999_{lens.ending}.TIF"
@@ -151,11 +151,11 @@ def write_panel(root: Path) -> str:
     return "IMG_170101_100000_9999"
 
 
-def write_poses(path: Path, lenses: tuple[LensOfRig, ...] = LENSES[:1], releases: int = 10) -> None:
+def write_poses(path: Path, lenses: tuple[LensOfRig, ...] = LENSES[:1], shots: int = 10) -> None:
     """True poses of some lenses, with their lens, as nerfstudio writes them."""
     frames = [
         {"file_path": f"images/{file_name(index, lens)}", "transform_matrix": lens_pose(index, lens).tolist()}
-        for index in range(releases)
+        for index in range(shots)
         for lens in lenses
     ]
     path.write_text(json.dumps({"frames": frames}))

@@ -38,7 +38,7 @@ from unmix_plugin.scenes.reading.loader import load_scene
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory):
     root = tmp_path_factory.mktemp("flight")
-    write_flight(root, releases=8)
+    write_flight(root, shots=8)
     (root / "IMG_170101_101000_0000_RGB.JPG").write_bytes(b"a picture in colour")
     return root
 
@@ -52,7 +52,7 @@ def _frames(scene):
 def scene(flight, tmp_path_factory):
     """The scene that the command makes from the poses of the green lens alone."""
     folder = tmp_path_factory.mktemp("scenes")
-    write_poses(folder / "poses.json", releases=8)
+    write_poses(folder / "poses.json", shots=8)
     _process(flight, folder)
     return folder / "scene"
 
@@ -62,22 +62,22 @@ def _process(root, folder, **given):
 
 
 def _value(folder, index, lens):
-    """What the scene stores for a lens of a release, in the unit of the camera."""
+    """What the scene stores for a lens of a shot, in the unit of the camera."""
     one = json.loads((folder / "process.json").read_text())["stored"]["calibrated_value_of_1"]
     path = next((folder / "cubes").glob(f"*_{index:04d}_{lens.ending}.npy"))
     return np.load(path)[..., 0] / 65535 * one, one
 
 
-def test_every_file_is_a_view_of_its_lens_and_release(flight):
+def test_every_file_is_a_view_of_its_lens_and_shot(flight):
     capture = find_rig(flight, PLAIN)
     assert len(capture.views) == 32
     assert {view.sensor for view in capture.views} == {"green", "red", "rededge", "nir"}
-    releases = {(view.shot, view.name.split("_")[-2]) for view in capture.views}
-    assert len(releases) == len({release for release, _ in releases}) == 8
+    shots = {(view.shot, view.name.split("_")[-2]) for view in capture.views}
+    assert len(shots) == len({shot for shot, _ in shots}) == 8
     assert any("1 colour picture left out" in note for note in capture.notes)
 
 
-def test_frames_have_their_band_lens_and_release_and_releases_stay_together_when_views_are_split(scene):
+def test_frames_have_their_band_lens_and_shot_and_shots_stay_together_when_views_are_split(scene):
     content, frames = _frames(scene)
     assert content["wavelengths"] == [550.0, 660.0, 735.0, 790.0]
     assert content["fwhm"] == [40.0, 40.0, 10.0, 40.0]
@@ -123,9 +123,9 @@ def test_the_scene_holds_the_radiance_of_the_ground(scene):
 
 
 def test_a_panel_before_the_flight_makes_reflectances(tmp_path):
-    write_flight(tmp_path / "flight", releases=3)
+    write_flight(tmp_path / "flight", shots=3)
     panel = write_panel(tmp_path / "flight")
-    write_poses(tmp_path / "poses.json", releases=3)
+    write_poses(tmp_path / "poses.json", shots=3)
     options = {"white_rectangle": (panel, 10, 12, 20, 30), "white_reflectance": "0.5"}
     _process(tmp_path / "flight", tmp_path, **options)
     assert not list((tmp_path / "scene" / "cubes").glob("*_9999_*"))
@@ -147,7 +147,7 @@ def test_lenses_without_a_calibration_of_their_own_are_brought_to_one_exposure(t
         counts = card * (lens.exposure_s / 0.004) * (2.2 / f_number) ** 2
         exif = {"FocalPlaneXResolution": PX_A_MM} | (told if is_told or lens.ending != "RED" else {})
         write_band_file(tmp_path / "flight" / file_name(index, lens), counts, own, exif)
-    write_poses(tmp_path / "poses.json", releases=3)
+    write_poses(tmp_path / "poses.json", shots=3)
     wrong = _process(tmp_path / "flight", tmp_path)
     means = [_value(tmp_path / "scene", 1, lens)[0].mean() for lens in LENSES]
     assert any("exposures of red are not known or not compared" in text for text in wrong) != is_told
@@ -166,7 +166,7 @@ def rig_of(folder, files, size=(4, 5)):
 
 
 @pytest.mark.parametrize(
-    ("files", "releases"),
+    ("files", "shots"),
     [
         ({f"DJI_00{number}.TIF": {} for number in (11, 12, 21)}, ["DJI_001", "DJI_001", "DJI_002"]),
         ({"IMG_0001_1.tif": {}, "IMG_0001_10.tif": {}}, ["IMG_0001", "IMG_0001"]),
@@ -182,15 +182,15 @@ def rig_of(folder, files, size=(4, 5)):
         ),
     ],
 )
-def test_names_and_identifiers_of_makers_tell_releases(tmp_path, files, releases):
+def test_names_and_identifiers_of_makers_tell_shots(tmp_path, files, shots):
     views = rig_of(tmp_path, {name: (500, tags) for name, tags in files.items()}).views
-    assert [view.shot for view in views] == releases
+    assert [view.shot for view in views] == shots
 
 
 def test_a_file_without_the_calibration_that_others_of_its_lens_have_is_refused(tmp_path):
     """Its stored numbers would be thousands of times the radiance of the others."""
-    write_flight(tmp_path / "flight", releases=3)
-    write_poses(tmp_path / "poses.json", releases=3)
+    write_flight(tmp_path / "flight", shots=3)
+    write_poses(tmp_path / "poses.json", shots=3)
     path = next((tmp_path / "flight").glob("*_0001_RED.TIF"))
     path.write_bytes(path.read_bytes().replace(b"Camera:SensorModel>", b"Camera:SensorModeX>"))
     with pytest.raises(CaptureError, match=r"_0001_RED\.TIF has no calibration of its maker .*Parrot"):
@@ -208,12 +208,12 @@ def test_lenses_are_told_by_their_file_or_index(tmp_path):
 
 def test_thermal_bands_and_missing_bands_are_said(tmp_path):
     named = (("0000", "1", "B1", 501), ("0000", "2", "B2", 502), ("0000", "6", "LWIR", 11000))
-    files = {f"IMG_{release}_{n}.tif": (nm, {"Camera:BandName": band}) for release, n, band, nm in named}
+    files = {f"IMG_{shot}_{n}.tif": (nm, {"Camera:BandName": band}) for shot, n, band, nm in named}
     capture = rig_of(tmp_path, files | {"IMG_0001_1.tif": (501, {"Camera:BandName": "B1"})})
     assert [view.name for view in capture.views] == ["IMG_0000_1", "IMG_0000_2", "IMG_0001_1"]
     notes = " ".join(capture.notes)
     assert "1 thermal image left out" in notes
-    assert "1 of 2 releases lack a band: IMG_0001" in notes
+    assert "1 of 2 shots lack a band: IMG_0001" in notes
 
 
 def test_given_wavelengths_are_one_a_lens(tmp_path):

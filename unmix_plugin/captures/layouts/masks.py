@@ -48,8 +48,9 @@ def _no_mask(view: CaptureView, candidates: Sequence[tuple[Path, str]]) -> Captu
     names = [*dict.fromkeys(name for _, name in candidates if name.endswith(".png"))]
     has_folder = any(folder.name in MASK_FOLDERS for folder in folders)
     return CaptureError(
-        f"--mask files: view {view.name} has no mask; expected an alpha channel, or a mask that is white where matter "
-        f"is, for every view. Looked for {name_some(names, 6)} in {name_some([str(one) for one in folders], 6)}"
+        f"--mask files: view {view.name} has no mask; expected an alpha channel, or a mask that is white where the "
+        f"foreground is, for every view. Looked for {name_some(names, 6)} in "
+        f"{name_some([str(folder) for folder in folders], 6)}"
         + ("" if has_folder else "; there is no folder masks/ beside the images")
     )
 

@@ -83,7 +83,7 @@ def find_rig(root: Path, options: ReadOptions) -> Capture:
         notes.append(f"{pictures}: nothing says what their channels measure")
     counts = Counter(shots)
     if incomplete := [shot for shot, count in counts.items() if count < max(counts.values())]:
-        notes.append(f"{len(incomplete)} of {len(counts)} releases lack a band: {name_some(incomplete)}")
+        notes.append(f"{len(incomplete)} of {len(counts)} shots lack a band: {name_some(incomplete)}")
     views: list[CaptureView] = []
     missing: Counter[tuple[str, str]] = Counter()
     for item, name, sensor, shot in zip(bands, names, sensors, shots, strict=True):
@@ -116,7 +116,7 @@ def _check_lenses(views: Sequence[CaptureView]) -> None:
         other = taken.setdefault((view.shot, view.sensor), view)
         if other is not view:
             both = f"{other.cube.path} and {view.cube.path} are both the lens {view.sensor}"
-            raise CaptureError(f"{both} of the release {view.shot}; remove the copy")
+            raise CaptureError(f"{both} of the shot {view.shot}; remove the copy")
         same = first.setdefault(view.sensor, view)
         tables = (same.cube.bands.wavelengths_nm, view.cube.bands.wavelengths_nm)
         centres = [None if table is None else float(table[0]) for table in tables]

@@ -3,7 +3,7 @@ NeSpoF's captures, `nespof-real`.
 
 The frames are those of transforms.json, or of Blender's transforms_train.json and its like, whose paths have no suffix.
 
-`nerfstudio`: RGB pictures, each as a cube of three bands without wavelengths; an alpha channel says what is matter.
+`nerfstudio`: RGB pictures, each as a cube of three bands without wavelengths; an alpha channel says what is foreground.
 Files of other kinds are opened as what they are, such as the ENVI headers of HSI-Nerfstudio in `datadir`.
 
 `unmix-nerf`: frames have `hyperspectral_file_path`. UnMix-NeRF names .npy cubes, wavelengths and labels. Splits are

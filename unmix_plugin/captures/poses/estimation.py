@@ -47,7 +47,7 @@ _ENOUGH = 0.9
 _FOCAL_FACTORS = (1.2, 3.0, 7.0)
 """First focal lengths to try, over the longer side: wide, tele and far lenses."""
 _PEAK_THRESHOLD = 0.003
-"""Of features: half of COLMAP's, as matter in a laboratory has less texture than a street."""
+"""Of features: half of COLMAP's, as objects in a laboratory have less texture than a street."""
 _MOST_FEATURES = 8192
 """Of a picture."""
 _SEED = 0
@@ -96,7 +96,7 @@ def estimate_poses(
         pictures: By the name of the view; with high contrast (see `contrast_picture`).
         folder: For COLMAP's files and its log; is made.
         sensor_of: Sensor of each view; views of one have one lens and one size. None is one for all.
-        masks: True on matter; features are found there, but not on its rim.
+        masks: True on the foreground; features are found there, but not on its rim.
         threads: None takes those of the machine, at most 8; with 1 the same pictures give the same poses to the bit.
     Returns:
         Poses by the name of the view, in an arbitrary world (`has_world` is False).

@@ -31,7 +31,7 @@ _MOST_FEATURES, _ENLARGED_PX = 2000, 600
 _STILL_PX = 2.0
 """Matches of views that moved less stand still as the object turns: stains, noise, the background."""
 _LEAST_PART = 0.02
-"""Of the matter of a view: smaller parts of its mask are specks."""
+"""Of the foreground of a view: smaller parts of its mask are specks."""
 
 
 @dataclass(frozen=True)

@@ -294,7 +294,7 @@ def _what_was_done(plan: Plan, posed: PosedViews, views: Sequence[ViewRecord]) -
         f"written as 1 too; {total('negative_values')} below 0 ({negative:.1%} of all), written as 0; "
         f"{total('missing_pixels')} masked, as nothing was measured there"
     )
-    share = f"{np.mean([view.matter_share for view in views]):.0%} of the pixels are matter"
+    share = f"{np.mean([view.matter_share for view in views]):.0%} of the pixels are foreground"
     found = [recipe.background for recipe in plan.recipes.values() if isinstance(recipe.background, Backdrop)]
     changed = f"{total('specks')} removed, {total('holes')} filled"
     if found:
@@ -304,7 +304,7 @@ def _what_was_done(plan: Plan, posed: PosedViews, views: Sequence[ViewRecord]) -
             f"edges; {changed}" + (f"; {counted(whole, 'view')} without any of it" if whole else "")
         )
     elif plan.mask == "none":
-        lines.append("no mask of matter: all of each image belongs to the scene")
+        lines.append("no mask of the foreground: all of each image belongs to the scene")
     elif plan.mask == "files":
         lines.append(f"masks from files; {share}")
     else:
@@ -389,7 +389,7 @@ def _tiles(views: Sequence[SeenView], left_out: Sequence[ViewRecord]) -> UInt8[n
 
 
 def _small_picture(picture_file: Path, record: ViewRecord, side_px: int) -> UInt8[np.ndarray, "h w 3"]:
-    """The view on dark grey, with the outline of matter and with pixels that are ignored."""
+    """The view on dark grey, with the outline of the foreground and with pixels that are ignored."""
     from PIL import Image
     from scipy import ndimage
 
@@ -399,8 +399,8 @@ def _small_picture(picture_file: Path, record: ViewRecord, side_px: int) -> UInt
         picture = np.asarray(opened.convert("RGBA").resize(size, Image.Resampling.BOX))
     opacity = picture[..., 3:] / 255.0
     pixels = np.rint(picture[..., :3] * opacity + _BEHIND * (1 - opacity)).astype(np.uint8)
-    matter = picture[..., 3] > 127
-    pixels[matter & np.logical_not(ndimage.binary_erosion(matter, border_value=1))] = OUTLINE
+    foreground = picture[..., 3] > 127
+    pixels[foreground & np.logical_not(ndimage.binary_erosion(foreground, border_value=1))] = OUTLINE
     mask = record.paths.get("mask_path")
     if mask is not None:
         with Image.open(picture_file.parent.parent / mask) as opened:
@@ -450,7 +450,7 @@ def _draw_spectra(axes: Any, views: Sequence[SeenView], sensors: Mapping[str, Se
         style = {"color": "#d04040", "linewidth": 0.8, "alpha": 0.6, "label": "bands left out"}
         axes.vlines(dropped, 0.0, 1.0, transform=axes.get_xaxis_transform(), **style)
     axes.set_ylim(bottom=0.0)
-    axes.set_title("mean spectra of matter", fontsize=9)
+    axes.set_title("mean spectra of the foreground", fontsize=9)
     axes.set_xlabel("wavelength in nm", fontsize=8)
     axes.tick_params(labelsize=7)
     axes.legend(fontsize=7, frameon=False)

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 _FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "GIF", "WEBP")
 """Pillow reads more, some of them with other programs."""
 HALF, OPAQUE = 127, 255
-"""Opacity above which a pixel counts as matter; that of matter that covers a pixel."""
+"""Opacity above which a pixel counts as foreground; that of foreground that covers a pixel."""
 _SMALL_SHARE = 5e-4
 """Specks and holes smaller than this share of the picture are removed."""
 FULL_SCALE = 65535
@@ -64,14 +64,14 @@ class BackgroundRule:
         """For the record."""
         return asdict(self)
 
-    def matter(self, values: Float32[np.ndarray, "h W B"]) -> Bool[np.ndarray, "h W"]:
+    def foreground(self, values: Float32[np.ndarray, "h W B"]) -> Bool[np.ndarray, "h W"]:
         """Pixels that are not background."""
         brightness = self.brightness(self.kind, values)
         return brightness < self.threshold if self.kind == "white" else brightness > self.threshold
 
     @staticmethod
     def brightness(kind: str, values: Float32[np.ndarray, "*pixels B"]) -> np.ndarray:
-        """What tells background from matter: white is bright in every band, black is dark in the mean."""
+        """What tells background from foreground: white is bright in every band, black is dark in the mean."""
         return values.min(axis=-1) if kind == "white" else values.mean(axis=-1)
 
 
@@ -85,7 +85,7 @@ class ViewRecord:
     """Files by the keys of transforms.json, relative to the scene."""
     num_pixels: int
     saturated_pixels: int
-    """Of matter, with at least one band at the detector's top; such bands are written as 1."""
+    """Of the foreground, with at least one band at the detector's top; such bands are written as 1."""
     clipped_values: int
     """Values above the scale that are not saturated; written as 1 too."""
     negative_values: int
@@ -98,11 +98,11 @@ class ViewRecord:
     holes: int
     """Parts of the mask that were removed and filled."""
     brightness: float
-    """Median over pixels of matter of the mean over bands."""
+    """Median over pixels of the foreground of the mean over bands."""
     detail: float
     """Contrast of the finest structures against those twice as large."""
     mean_spectrum: list[float]
-    """Over pixels of matter."""
+    """Over pixels of the foreground."""
     background_brightness: float = 0.0
     """Median of the same over background, before it is set to black; 0 without any."""
     background_spread: float = 0.0
@@ -124,7 +124,7 @@ class ViewRecipe:
     """From spectra to linear red, green and blue, 1 is white; the same for all views of a sensor."""
     background: BackgroundRule | Backdrop | None = None
     use_opacity: bool = False
-    """Whether files of the capture say what is matter."""
+    """Whether files of the capture say what is foreground."""
 
 
 def write_view(
@@ -207,7 +207,7 @@ class _Tally:
                 self.features = np.zeros((*self.missing.shape, features.shape[-1]), np.float32)
             self.features[rows] = features
         elif recipe.background is not None:
-            self.opacity[rows] = np.where(recipe.background.matter(values), OPAQUE, 0)
+            self.opacity[rows] = np.where(recipe.background.foreground(values), OPAQUE, 0)
         self.rgb[rows] = values @ recipe.to_rgb
         self.brightness[rows] = values.mean(axis=-1)
         counted = (self.opacity[rows] > HALF) & ~self.missing[rows]
@@ -227,12 +227,12 @@ class _Tally:
             assert self.features is not None
             seen = recipe.background.find(self.features, ~self.missing)
             if seen is not None:
-                matter, self.specks, self.holes = clean_mask(~seen.shown)
-                self.opacity = np.rint(seen.opacity(matter) * OPAQUE).astype(np.uint8)
+                foreground, self.specks, self.holes = clean_mask(~seen.shown)
+                self.opacity = np.rint(seen.opacity(foreground) * OPAQUE).astype(np.uint8)
                 self.features = seen.behind
         elif recipe.background is not None:
-            matter, self.specks, self.holes = clean_mask(self.opacity > 0)
-            self.opacity = np.where(matter, OPAQUE, 0).astype(np.uint8)
+            foreground, self.specks, self.holes = clean_mask(self.opacity > 0)
+            self.opacity = np.where(foreground, OPAQUE, 0).astype(np.uint8)
         self.opacity[self.missing] = OPAQUE
 
     def record(self, view: CaptureView, paths: dict[str, str]) -> ViewRecord:
@@ -306,7 +306,7 @@ def detail_of(brightness: Float32[np.ndarray, "H W"], seen: Bool[np.ndarray, "H 
 
 
 def _finest_contrast(picture: Float32[np.ndarray, "H W"], seen: Bool[np.ndarray, "H W"]) -> float:
-    """Root mean square of pixels less the mean of their four neighbours, where all five are matter."""
+    """Root mean square of pixels less the mean of their four neighbours, where all five are foreground."""
     around = [(slice(0, -2), slice(1, -1)), (slice(2, None), slice(1, -1))]
     around += [(columns, rows) for rows, columns in around]
     middle = (slice(1, -1), slice(1, -1))
@@ -326,7 +326,7 @@ class ViewMasks:
     valid: Bool[np.ndarray, "H W"]
     """Pixels that are not to be ignored."""
     opacity: UInt8[np.ndarray, "H W"] | None
-    """255 where matter covers a pixel; None where no file says so."""
+    """255 where foreground covers a pixel; None where no file says so."""
     straight: UInt8[np.ndarray, "h w"] | None = None
     """Opacity of the raster's pixels before they are averaged, where the cube is a picture whose colours are not
     multiplied by it. Source: PNG specification, whose colours never are."""
@@ -421,7 +421,7 @@ def _read(path: Path, pixels_of: Callable[[Image.Image], np.ndarray], view: Capt
         raise CaptureError(f"{path} of view {view.name} {error}") from error
 
 
-def clean_mask(matter: Bool[np.ndarray, "H W"]) -> tuple[Bool[np.ndarray, "H W"], int, int]:
+def clean_mask(foreground: Bool[np.ndarray, "H W"]) -> tuple[Bool[np.ndarray, "H W"], int, int]:
     """Remove specks, then fill holes, each connected by edges and smaller than `_SMALL_SHARE` of the picture.
 
     Returns:
@@ -435,8 +435,8 @@ def clean_mask(matter: Bool[np.ndarray, "H W"]) -> tuple[Bool[np.ndarray, "H W"]
     >>> int(cleaned.sum()), specks, holes
     (3600, 1, 1)
     """
-    smallest = max(4, round(_SMALL_SHARE * matter.size))
-    kept, specks = _without_small(matter, smallest)
+    smallest = max(4, round(_SMALL_SHARE * foreground.size))
+    kept, specks = _without_small(foreground, smallest)
     background, holes = _without_small(~kept, smallest)
     return ~background, specks, holes
 
