@@ -371,8 +371,8 @@ def _widths_nm(
     fitting = [one for one in tried if ((widths * one <= centres) & (widths * one >= _LEAST_WIDTH_NM)).all()]
     low, high = widths.min(), widths.max()
     if not fitting:
-        said = f"{low * tried[0]:g} to {high * tried[0]:g} nm" if tried[0] > 0 else f"in {unit!r}"
-        remarks.append(Remark.of(Code.WIDTHS_IMPOSSIBLE, range=said))
+        shown = f"{low * tried[0]:g} to {high * tried[0]:g} nm" if tried[0] > 0 else f"in {unit!r}"
+        remarks.append(Remark.of(Code.WIDTHS_IMPOSSIBLE, range=shown))
         return None
     if fitting[0] != tried[0]:
         taken = "nm" if fitting[0] == 1.0 else "micrometres"

@@ -133,7 +133,7 @@ def _sightings(plan: Plan, options: ProcessOptions) -> tuple[Sightings, list[str
             continue
         calibration = plan.recipes[sensor].calibration
         views = [view for view in plan.views if view.sensor == sensor]
-        found, said = find_markers(
+        found, more_notes = find_markers(
             {view.name: _light(view, calibration, [band])[0] for view in views}, chosen
         )
         sightings |= found
@@ -142,7 +142,7 @@ def _sightings(plan: Plan, options: ProcessOptions) -> tuple[Sightings, list[str
             if band is None
             else f"the band at {plan.sensors[sensor].centers_nm[band]:g} nm"
         )
-        notes += [f"{sensor + ': ' if sensor else ''}markers of {chosen} found in {where}", *said]
+        notes += [f"{sensor + ': ' if sensor else ''}markers of {chosen} found in {where}", *more_notes]
     if not sightings:
         asked, hint = "no markers", ""
         if family is not None:

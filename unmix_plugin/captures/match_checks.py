@@ -93,9 +93,13 @@ class _Star:
         ideal = self.ideal[:, kept]
         shown = np.isfinite(ideal[..., 0])
         ideal = ideal[shown[:, 0] & (shown.sum(axis=1) >= _LEAST_VIEWS)]
-        left = tuple(index for index in self.views if index not in views)
+        kept_views = tuple(index for index in self.views if index not in views)
         return replace(
-            self, ideal=ideal, rotations=self.rotations[kept], positions=self.positions[kept], views=left
+            self,
+            ideal=ideal,
+            rotations=self.rotations[kept],
+            positions=self.positions[kept],
+            views=kept_views,
         )
 
     def centre_miss_px(self) -> float:
@@ -165,10 +169,10 @@ class MatchedScene:
 
     def without(self, views: Collection[str]) -> MatchedScene:
         """The points that the other views share."""
-        gone = [index for index, name in enumerate(self.names) if name in views]
-        left = [star.without(gone) for star in self.stars if star.views[0] not in gone]
-        features = {index: own for index, own in self.features.items() if index not in gone}
-        return replace(self, stars=tuple(star for star in left if len(star.ideal)), features=features)
+        excluded = [index for index, name in enumerate(self.names) if name in views]
+        kept = [star.without(excluded) for star in self.stars if star.views[0] not in excluded]
+        features = {index: found for index, found in self.features.items() if index not in excluded}
+        return replace(self, stars=tuple(star for star in kept if len(star.ideal)), features=features)
 
 
 def views_of_other_poses(scene: MatchedScene) -> dict[str, Remark]:
@@ -187,16 +191,16 @@ def _among_strangers(scene: MatchedScene) -> dict[str, Remark]:
     usual = float(np.nanmedian([star.centre_miss_px() for star in scene.stars]))
     found: dict[str, Remark] = {}
     for view in sorted(scene.features.keys() - known):
-        own = scene.features[view]
-        if own is None:
+        ours = scene.features[view]
+        if ours is None:
             continue
         misses = []
         for other in sorted(known):
             theirs = scene.features[other]
             assert theirs is not None
-            pairs = _matches(own, theirs, _shrunk(scene.lens))
+            pairs = _matches(ours, theirs, _shrunk(scene.lens))
             if len(pairs[0]) > 2 * _LEAST_MATCHES:
-                seen = (own[0][pairs[0]], theirs[0][pairs[1]])
+                seen = (ours[0][pairs[0]], theirs[0][pairs[1]])
                 misses.append(_off_epipolar_lines_px(seen, scene.cameras[view], scene.cameras[other]))
         if len(misses) >= _LEAST_VIEWS - 1 and min(misses) > _POSES_OFF_PX:
             shrunk = _shrunk(scene.lens)

@@ -106,10 +106,10 @@ class SensorPlan:
         """Files of `dark` and `white`, where there are such, and how they are used, for people."""
         references = self.calibration.references
         used: dict[str, dict[str, str]] = {}
-        first = next(iter(references.own.values()), references.common)
+        first = next(iter(references.by_view.values()), references.common)
         for name in ("dark", "white"):
             of_view, of_all = getattr(first, name), getattr(references.common, name)
-            if references.own and of_view is not None:
+            if references.by_view and of_view is not None:
                 used[name] = {"file": "each view's own", "use": f"each view's own; {of_view.how}"}
             elif of_all is not None:
                 used[name] = {"file": str(of_all.file.path), "use": of_all.how}

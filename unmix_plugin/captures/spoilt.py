@@ -118,7 +118,7 @@ def judge_values(
         for index in np.flatnonzero(is_black).tolist():
             share = f"{max(0.0, brightness[index] / usual):.1%}"
             found[views[index].name] = Remark.of(Code.VIEW_BLACK, [views[index].name], share=share)
-    lit = [one > _LIT * own for one, own in zip(grey, brightness, strict=True)]
+    lit = [one > _LIT * level for one, level in zip(grey, brightness, strict=True)]
     judged = [index for index in range(len(views)) if not is_black[index] and lit[index].sum() >= _LEAST_LIT]
     if len(judged) >= LEAST_JUDGED:
         chosen = [views[index] for index in judged]

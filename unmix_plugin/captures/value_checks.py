@@ -71,19 +71,19 @@ _OTHER_COVER = 0.3
 
 def check_files(views: Sequence[CaptureView], options: ProcessOptions) -> list[Remark]:
     """Files of which most was not read, and bands that are too wide for one wavelength."""
-    left: list[str] = []
+    unread: list[str] = []
     wide: dict[float, float] = {}
     for view in views:
         cube, bands = view.cube, view.cube.bands
         size = sum(path.stat().st_size for path in cube.files if path.is_file())
         if size > _MOST_UNREAD * np.prod(cube.shape) * cube.dtype.itemsize + _HEADER_BYTES:
-            left.append(f"{cube.path.name} ({cube.shape[2]} bands of {size / 1e6:.1f} MB)")
+            unread.append(f"{cube.path.name} ({cube.shape[2]} bands of {size / 1e6:.1f} MB)")
         if bands.wavelengths_nm is not None and bands.fwhm_nm is not None:
             pairs = zip(bands.wavelengths_nm, bands.fwhm_nm, strict=True)
             wide |= {nm: width for nm, width in pairs if width > _WIDE_NM}
     remarks = []
-    if left and options.dataset is None and options.layout not in _CHOOSING_LAYOUTS:
-        remarks.append(Remark.of(Code.FILES_PARTLY_READ, files_read=len(left), named=", ".join(left[:3])))
+    if unread and options.dataset is None and options.layout not in _CHOOSING_LAYOUTS:
+        remarks.append(Remark.of(Code.FILES_PARTLY_READ, files_read=len(unread), named=", ".join(unread[:3])))
     if wide:
         named = [f"{nm:g} nm ({width:.0f} nm wide)" for nm, width in wide.items()]
         remarks.append(Remark.of(Code.BANDS_WIDE, bands=len(wide), named=named))

@@ -93,9 +93,9 @@ class BandChoice:
 
     def without_repeated(self) -> BandChoice:
         """The choice without bands whose wavelength an earlier one that is kept has."""
-        left = np.setdiff1d(np.arange(len(self.wavelengths_nm)), list(self.dropped))
-        first = left[np.unique(self.wavelengths_nm[left], return_index=True)[1]]
-        repeated = np.isin(np.arange(len(self.wavelengths_nm)), np.setdiff1d(left, first))
+        rest = np.setdiff1d(np.arange(len(self.wavelengths_nm)), list(self.dropped))
+        first = rest[np.unique(self.wavelengths_nm[rest], return_index=True)[1]]
+        repeated = np.isin(np.arange(len(self.wavelengths_nm)), np.setdiff1d(rest, first))
         return self.without(repeated, BandFault.REPEATED)
 
     def without_incomplete_bins(self, binning: int) -> BandChoice:
@@ -103,9 +103,9 @@ class BandChoice:
         was not measured, such as that of bands in which air absorbs. Single bad bands, or those of a second detector
         between those of the first, leave no gap."""
         kept = self.kept
-        own, others = self.wavelengths_nm[kept], self.wavelengths_nm[list(self.dropped)]
-        steps_nm = np.diff(own)
-        is_between = ((own[:-1, None] < others) & (others < own[1:, None])).any(axis=1)
+        kept_nm, dropped_nm = self.wavelengths_nm[kept], self.wavelengths_nm[list(self.dropped)]
+        steps_nm = np.diff(kept_nm)
+        is_between = ((kept_nm[:-1, None] < dropped_nm) & (dropped_nm < kept_nm[1:, None])).any(axis=1)
         around = np.pad(steps_nm, 1, constant_values=np.nan)
         # Several ranges may be left out with few bands between them.
         widest_nm = np.where(

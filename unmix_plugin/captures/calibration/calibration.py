@@ -48,8 +48,8 @@ class Raster:
         top, left, rows, columns = crop or (0, 0, height, width)
         refuse_outside("--crop", (top, left, rows, columns), (height, width))
         if binning < 1 or min(rows, columns) // binning < 2:
-            left = f"leaves fewer than 2 x 2 of {rows} x {columns} pixels"
-            raise ConfigError(f"--bin-pixels {binning} {left}; give a smaller number")
+            too_few = f"leaves fewer than 2 x 2 of {rows} x {columns} pixels"
+            raise ConfigError(f"--bin-pixels {binning} {too_few}; give a smaller number")
         return Raster(top, left, rows // binning, columns // binning, binning)
 
     @property
@@ -179,7 +179,7 @@ class Calibration:
         if dark is not None:
             values -= dark.rows(rows, columns, bands)
         factor, wanted, found = np.ones(1, np.float32), self.exposure, exposure_of(file)
-        if file.path in self.references.own and white is not None and wanted is not None:
+        if file.path in self.references.by_view and white is not None and wanted is not None:
             wanted = exposure_of(white.file)  # its own white reference
         if wanted is not None and found is not None:
             ratio = (wanted / found).astype(np.float32)

@@ -98,7 +98,7 @@ def calibrate_image(
     saturated = rows.saturated.any(axis=-1)
     remarks += compared.remarks if references.whites else []
     warnings = [*_doubts(file, references), *sentences(remarks, Kind.WRONG)]
-    used = next(iter(references.own.values()), references.common)
+    used = next(iter(references.by_view.values()), references.common)
     named = (("dark frame", used.dark), ("white reference", used.white))
     notes = [f"{kind} {one.file.path.name}: {one.how}" for kind, one in named if one]
     notes += sentences(remarks, Kind.DONE)
@@ -143,7 +143,7 @@ def _good_bands(file: Cube, lit: np.ndarray) -> np.ndarray:
 
 def _doubts(file: Cube, references: SensorReferences) -> list[str]:
     """That numbers are raw where they are, and references that are missing."""
-    has_dark = any(own.dark is not None for own in (references.common, *references.own.values()))
+    has_dark = any(used.dark is not None for used in (references.common, *references.by_view.values()))
     if references.whites and not has_dark and file.dtype.kind != "f":
         return [
             "there is a white reference and no dark frame (--dark): what is dark is taken as brighter than it is"

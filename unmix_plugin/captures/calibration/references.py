@@ -92,15 +92,15 @@ def require_comparable(file: Cube, other: Cube) -> None:
                 f"{other.path} has"
             )
     maker, other_maker = (model and model.maker for model in map(radiometric_model, (file, other)))
-    for what, own, others in (
+    for what, of_file, of_other in (
         ("gains or scale", file.linear and file.linear.source, other.linear and other.linear.source),
         ("calibration of its maker in its XMP", maker, other_maker),
     ):
-        if (own is None) != (others is None):
-            has, lacks = (file, other) if others is None else (other, file)
+        if (of_file is None) != (of_other is None):
+            has, lacks = (file, other) if of_other is None else (other, file)
             raise CaptureError(
-                f"{lacks.path} has no {what}, {has.path} has ({own or others}); expected both or neither, as numbers "
-                "of one can't be compared with those of the other"
+                f"{lacks.path} has no {what}, {has.path} has ({of_file or of_other}); expected both or neither, as "
+                "numbers of one can't be compared with those of the other"
             )
 
 
@@ -159,13 +159,13 @@ class Reference:
     @cached_property
     def signal(self) -> Float64[np.ndarray, " B"]:
         """Mean counts above its dark at each band of the file."""
-        own = self.mean.astype(np.float64).mean(axis=(0, 1))
+        counts = self.mean.astype(np.float64).mean(axis=(0, 1))
         if self.dark is None or self.rectangle is None:
-            return own if self.dark is None else own - self.dark.signal
+            return counts if self.dark is None else counts - self.dark.signal
         top, left, height, width = self.rectangle
         lines, columns = slice(top, top + height), slice(left, left + width)
-        behind = self.dark.rows(lines, columns, np.arange(len(own)))
-        return own - np.nanmean(behind, axis=(0, 1), dtype=np.float64)
+        behind = self.dark.rows(lines, columns, np.arange(len(counts)))
+        return counts - np.nanmean(behind, axis=(0, 1), dtype=np.float64)
 
 
 def open_reference(file: Cube, kind: ReferenceKind, cube: Cube) -> Reference:
@@ -346,17 +346,17 @@ class SensorReferences:
     """References of all views of a sensor."""
 
     common: ViewReferences = ViewReferences()
-    own: Mapping[Path, ViewReferences] = field(default_factory=dict)
+    by_view: Mapping[Path, ViewReferences] = field(default_factory=dict)
     """Of views that were taken with their own, by the path of their cube; they go before the common ones."""
 
     def of(self, file: Cube) -> ViewReferences:
         """Those of the view with this cube."""
-        return self.own.get(file.path, self.common)
+        return self.by_view.get(file.path, self.common)
 
     @property
     def whites(self) -> list[Reference]:
         """All white references, one a view where views have their own."""
-        used = [*self.own.values()] or [self.common]
+        used = [*self.by_view.values()] or [self.common]
         return [references.white for references in used if references.white is not None]
 
     def darks_beside(self, files: Sequence[Cube]) -> list[tuple[Cube, Cube]]:
@@ -403,10 +403,10 @@ def find_references(
         panel = _open_white(given.white, _own_dark(given.white) if dark is None else None, cube)
     white = panel and _as_white(panel, dark, options.white_reflectance, wavelengths_nm)
     common = ViewReferences(dark, white)
-    return SensorReferences(common, _own_references(views, wavelengths_nm, options, common))
+    return SensorReferences(common, _references_by_view(views, wavelengths_nm, options, common))
 
 
-def _own_references(
+def _references_by_view(
     views: Sequence[CaptureView],
     wavelengths_nm: Float64[np.ndarray, " B"],
     options: ProcessOptions,
@@ -425,7 +425,7 @@ def _own_references(
     if common.white is None:
         whites = _one_each({view.name: view.white for view in views}, ReferenceKind.WHITE)
     opened: dict[tuple[Path | None, Path | None], ViewReferences] = {}  # files that several views share
-    own: dict[Path, ViewReferences] = {}
+    by_view: dict[Path, ViewReferences] = {}
     for view in views:
         dark_file, white_file = darks.get(view.name), whites.get(view.name)
         if dark_file is None and white_file is None:
@@ -440,8 +440,8 @@ def _own_references(
                 panel = _open_white(white_file, darks_of_whites.get(white_file.path), view.cube)
                 white = _as_white(panel, dark, options.white_reflectance, wavelengths_nm)
             opened[key] = ViewReferences(dark, white)
-        own[view.cube.path] = opened[key]
-    return own
+        by_view[view.cube.path] = opened[key]
+    return by_view
 
 
 def _own_dark(file: Cube, beside: Cube | None = None) -> Cube | None:

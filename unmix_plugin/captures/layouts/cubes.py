@@ -121,10 +121,10 @@ def _open_views(
     shown = [path for path in files if path.suffix.lower() in _PICTURE_SUFFIXES]
     pictures, views = {path.with_name(_stem(path)): path for path in shown}, []
     unreadable = UnreadableViews(len(paths))
-    for name, path, own in zip(names, paths, references, strict=True):
+    for name, path, of_view in zip(names, paths, references, strict=True):
         plain = replace(options, wavelengths_nm=None)
         with unreadable.noted(name):
-            opened = {kind: open_spectral_file(reference, plain) for kind, reference in own.items()}
+            opened = {kind: open_spectral_file(reference, plain) for kind, reference in of_view.items()}
             cubes = [open_spectral_file(part, options) for part in (joined or {}).get(path, [path])]
             cube = cubes[0] if len(cubes) == 1 else join_lines(cubes)
             if path.suffix.lower() in _PICTURE_SUFFIXES and cube.dtype.itemsize == 1:
@@ -149,7 +149,7 @@ def _capture_of_groups(root: Path, folders: dict[Path, list[Path]], options: Rea
         beside = [path for path, of in named if of in stems or {f"{of}_cube", f"{of}-cube"} & stems]
         shown_too += beside
         joined |= (parts := _parts_of_scans([path for path in there if path not in beside]))
-        further = {path for own in parts.values() for path in own[1:]}
+        further = {path for scan in parts.values() for path in scan[1:]}
         cubes = [path for path in there if path not in beside and path not in further]
         is_step = folder != root and folder.name.lower() in _STEPS
         place = folder.parent if is_step else folder  # that stands for a view: NAME of NAME/capture
@@ -170,13 +170,13 @@ def _capture_of_groups(root: Path, folders: dict[Path, list[Path]], options: Rea
         names = view_names(
             [str(place.relative_to(root) / f"{name}.x") for place, name in complete], str(root)
         )
-    own = [
+    of_views = [
         {reference: group[reference] for reference in _OWN if reference in group and kind == "cube"}
         for group, kind in zip(complete.values(), kinds, strict=True)
     ]
     there = [path for folder in folders for path in _visible_files(folder)]
-    views, unreadable = _open_views(names, paths, own, there, options, joined)
-    counts = Counter(reference for references in own for reference in references)
+    views, unreadable = _open_views(names, paths, of_views, there, options, joined)
+    counts = Counter(reference for references in of_views for reference in references)
     notes = [
         f"{counts[kind]} of {len(views)} views have a {what}, which is used{' for all' * (counts[kind] == 1)} unless "
         f"{flag} names another"
@@ -206,17 +206,18 @@ def _parts_of_scans(cubes: Sequence[Path]) -> dict[Path, list[Path]]:
     found = {}
     for parts in series.values():
         (line, first), *others = sorted(parts)
-        end, own = line, [first]
+        end, parts_in_order = line, [first]
         for line, path in others:
-            end += open_spectral_file(own[-1]).shape[0]
+            end += open_spectral_file(parts_in_order[-1]).shape[0]
             if line != end:
                 raise CaptureError(
-                    f"{first.parent}: {own[-1].name} and {path.name} are named like parts of one scan by their first "
-                    f"lines, but the second begins at line {line}, and the first ends before {end}; rename them"
+                    f"{first.parent}: {parts_in_order[-1].name} and {path.name} are named like parts of one scan by "
+                    f"their first lines, but the second begins at line {line}, and the first ends before {end}; rename "
+                    "them"
                 )
-            own.append(path)
-        if len(own) > 1:
-            found[first] = own
+            parts_in_order.append(path)
+        if len(parts_in_order) > 1:
+            found[first] = parts_in_order
     return found
 
 
@@ -227,7 +228,7 @@ def _sort_into(
     or a kind of reference. Returns references of no view."""
     stems = [_stem(path) for path in cubes]
     references = [path for path in cubes if _is_reference(path, stems)]
-    own = []
+    views_here = []
     for path in cubes:
         if path in references:
             continue
@@ -237,7 +238,7 @@ def _sort_into(
         other = group.setdefault("result" if is_result else "cube", path)
         if other is not path:
             raise CaptureError(_same_name(other, path))
-        own += [] if is_result else [_stem(path)]
+        views_here += [] if is_result else [_stem(path)]
     left_out = []
     for path in references:
         match = _REFERENCE.fullmatch(_stem(path))
@@ -245,9 +246,9 @@ def _sort_into(
         word = (match["kind"] or match["kind2"]).lower()
         kind = "white" if word in ("white", "flat") else "dark" if word == "dark" else "white_dark"
         of = match["of"] or match["of2"]
-        owners = [stem for stem in own if of is not None and stem.casefold() == of.casefold()]
-        if not owners and is_tree and (len(own) == 1 or of is None):
-            owners = own
+        owners = [stem for stem in views_here if of is not None and stem.casefold() == of.casefold()]
+        if not owners and is_tree and (len(views_here) == 1 or of is None):
+            owners = views_here
         for stem in owners:
             groups[place, stem][kind] = path
         left_out += [] if owners else [path]
@@ -279,7 +280,8 @@ def _cubes_below(root: Path, excluded: set[Path]) -> dict[Path, list[Path]]:
         folders[:] = sorted(
             name
             for name in folders
-            if not name.startswith(".") and not any((folder / name / own).is_file() for own in _OF_SCENES)
+            if not name.startswith(".")
+            and not any((folder / name / record).is_file() for record in _OF_SCENES)
         )
         if len(folder.relative_to(root).parts) == _DEEPEST:
             folders.clear()
@@ -315,9 +317,9 @@ def _band_folders(root: Path, excluded: set[Path]) -> list[Path]:
     suffixes = [[file.suffix.lower() for file in _visible_files(path)] for path in folders]
     return sorted(
         path
-        for path, own in zip(folders, suffixes, strict=True)
-        if sum(suffix in _BAND_SUFFIXES for suffix in own) > 1
-        and not _CUBE_SUFFIXES - _BAND_SUFFIXES & set(own)
+        for path, held in zip(folders, suffixes, strict=True)
+        if sum(suffix in _BAND_SUFFIXES for suffix in held) > 1
+        and not _CUBE_SUFFIXES - _BAND_SUFFIXES & set(held)
     )
 
 

@@ -116,8 +116,8 @@ def _mask_folders(folder: Path, root: Path) -> list[Path]:
     return [
         *dict.fromkeys(
             top.joinpath(name, *inner)
-            for top, whole, own in zip(tops, between, below, strict=True)
+            for top, whole, inner_parts in zip(tops, between, below, strict=True)
             for name in MASK_FOLDERS
-            for inner in (own, whole.parts, ())
+            for inner in (inner_parts, whole.parts, ())
         )
     ]

@@ -166,9 +166,9 @@ def _make_capture(
         poses = replace(poses, cameras=cameras)
     except CaptureError as error:
         no_poses = f"the poses of the capture can't be used: {error}"
-    said = (*listed.notes, *notes, *filter(None, [no_poses]))
+    all_notes = (*listed.notes, *notes, *filter(None, [no_poses]))
     ordered = sorted(views, key=lambda view: natural_order(view.name))
-    return Capture(layout, root, tuple(ordered), poses, said, tuple(warnings), no_poses=no_poses)
+    return Capture(layout, root, tuple(ordered), poses, all_notes, tuple(warnings), no_poses=no_poses)
 
 
 def find_nerfstudio(root: Path, options: ReadOptions) -> Capture:
@@ -206,7 +206,7 @@ def _find_cubes(layout: str, root: Path, options: ReadOptions) -> Capture:
     stated, warnings = _state_cubes(root, listed, options)
     views = []
     found, moved, unlabelled = FoundFiles(root), 0, 0
-    for frame, name, split, said in zip(listed.frames, names, by_folder, stated, strict=True):
+    for frame, name, split, stated_cube in zip(listed.frames, names, by_folder, stated, strict=True):
         text = frame.text(CUBE_KEY)
         cube = found.find(frame.where, text, _in_eval(text))
         if cube is None:
@@ -223,8 +223,12 @@ def _find_cubes(layout: str, root: Path, options: ReadOptions) -> Capture:
             )
         )
         unlabelled += labels is None and frame.text("seg_file_path") != ""
-        file, split, shot = _open_cube(cube, said, options), frame.split or split, frame.text("capture")
-        view = CaptureView(name, file, said.sensor, picture, mask, labels, shot=shot, split=split)
+        file, split, shot = (
+            _open_cube(cube, stated_cube, options),
+            frame.split or split,
+            frame.text("capture"),
+        )
+        view = CaptureView(name, file, stated_cube.sensor, picture, mask, labels, shot=shot, split=split)
         views.append(view)
     found.refuse_missing(
         "copy them into the folder; if there are RGB pictures alone, take the layout 'nerfstudio'"
@@ -235,8 +239,10 @@ def _find_cubes(layout: str, root: Path, options: ReadOptions) -> Capture:
             f"{counted(unlabelled, 'view')} without the labels that transforms.json names: no such files"
         )
     given = {*listed.top, *(key for frame in listed.frames for key in frame.values)}
-    if left := [key for key in _TRUTH_KEYS if key in given]:
-        notes.append(f"not taken over from transforms.json: {', '.join(left)}; copy what still fits yourself")
+    if not_copied := [key for key in _TRUTH_KEYS if key in given]:
+        notes.append(
+            f"not taken over from transforms.json: {', '.join(not_copied)}; copy what still fits yourself"
+        )
     return _make_capture(layout, root, listed, views, notes, warnings)
 
 
@@ -275,22 +281,22 @@ def _state_cubes(root: Path, listed: _FrameList, options: ReadOptions) -> tuple[
         warnings, widths = [f"'fwhm' has 0 or null for {counts}: the widths of all count as unknown"], None
     entries = []
     for frame in listed.frames:
-        own = read_frame_keys(frame.values, frame.where, faults)
-        own_bands = None if own.bands is None else tuple(own.bands)
+        keys_of_frame = read_frame_keys(frame.values, frame.where, faults)
+        own_bands = None if keys_of_frame.bands is None else tuple(keys_of_frame.bands)
         for message in _not_followed(frame, own_bands, None if centres is None else len(centres)):
             faults.add(frame.where, message)
-        entries.append((own.sensor, own_bands))
+        entries.append((keys_of_frame.sensor, own_bands))
     faults.raise_if_any(CaptureError)
     # Frames without a name are of one sensor if their bands are the same.
     unnamed = list(dict.fromkeys(own_bands for sensor, own_bands in entries if sensor is None))
     stated = []
     for sensor, own_bands in entries:
         number = f"bands {unnamed.index(own_bands) + 1}" if sensor is None and len(unnamed) > 1 else ""
-        own = slice(None) if own_bands is None else list(own_bands)
+        indices = slice(None) if own_bands is None else list(own_bands)
         bands = None
         if centres is not None:
-            own_widths = None if widths is None else widths[own]
-            bands = BandTable(centres[own], "'wavelengths' of transforms.json, nm", own_widths)
+            own_widths = None if widths is None else widths[indices]
+            bands = BandTable(centres[indices], "'wavelengths' of transforms.json, nm", own_widths)
         stated.append(_StatedCube(sensor or number, bands, keys.value_scale, own_bands is not None))
     return stated, warnings
 

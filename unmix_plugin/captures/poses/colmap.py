@@ -195,15 +195,15 @@ class _Reader:
         return layout.unpack_from(self._data, start)
 
     def skip(self, count: int) -> None:
-        if count > (left := len(self._data) - self._at):
-            raise CaptureError(f"{self._path} ends early: {left} of {count} bytes are left; copy it again")
+        if count > (rest := len(self._data) - self._at):
+            raise CaptureError(f"{self._path} ends early: {rest} of {count} bytes are left; copy it again")
         self._at += count
 
     def count(self, least_bytes: int, what: str) -> int:
         """A number of records, each of at least so many bytes."""
         (count,) = self.take(struct.Struct("<Q"))
-        if count * least_bytes > (left := len(self._data) - self._at):
-            raise CaptureError(f"{self._path} promises {count} {what}, {left} bytes follow; copy it again")
+        if count * least_bytes > (rest := len(self._data) - self._at):
+            raise CaptureError(f"{self._path} promises {count} {what}, {rest} bytes follow; copy it again")
         return count
 
     def text(self) -> str:

@@ -118,9 +118,9 @@ def estimate_poses(
             for name, mask in masks.items()
         }
     digest = hashlib.sha256()  # what tells whether an earlier try looked at the same
-    for kind, own in shown.items():
+    for kind, shown_of_kind in shown.items():
         (folder / kind).mkdir(parents=True, exist_ok=True)
-        for name, pixels in own.items():
+        for name, pixels in shown_of_kind.items():
             Image.fromarray(pixels).save(folder / kind / name)
             digest.update(f"{kind}/{name} {pixels.shape}".encode() + pixels.tobytes())
     sensors: dict[str, list[str]] = {}
@@ -140,12 +140,12 @@ def estimate_poses(
 
 def _run(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Start the process that reconstructs, with its output in the log file; or take what an earlier try found."""
-    result, asked, told = folder / _RESULT, folder.resolve() / "settings.json", json.dumps(settings)
-    if result.is_file() and asked.is_file() and asked.read_text(encoding="utf-8") == told:
+    result, asked, wanted = folder / _RESULT, folder.resolve() / "settings.json", json.dumps(settings)
+    if result.is_file() and asked.is_file() and asked.read_text(encoding="utf-8") == wanted:
         with contextlib.suppress(ValueError):  # cut short by a kill: found anew
             return json.loads(result.read_text(encoding="utf-8"))
     result.unlink(missing_ok=True)
-    asked.write_text(told, encoding="utf-8")
+    asked.write_text(wanted, encoding="utf-8")
     command = child_command("unmix_plugin.captures.poses.estimation", [str(asked)])
     with (folder / _LOG).open("wb") as log:
         ran = subprocess.run(command, stdout=log, stderr=log, stdin=subprocess.DEVNULL, check=False)
@@ -286,8 +286,8 @@ def _reconstruct(path: Path) -> None:
         found += _map(pycolmap, settings, database, folder / "models" / f"{factor:g}")
         if max((model["registered"] for model in found), default=0) >= _ENOUGH * count:
             break
-    told = {"models": found, "views": _matches_of_views(pycolmap, database)}
-    (folder / _RESULT).write_text(json.dumps(told), encoding="utf-8")
+    result = {"models": found, "views": _matches_of_views(pycolmap, database)}
+    (folder / _RESULT).write_text(json.dumps(result), encoding="utf-8")
 
 
 def _matches_of_views(pycolmap: Any, database: Path) -> dict[str, Any]:
@@ -304,11 +304,14 @@ def _matches_of_views(pycolmap: Any, database: Path) -> dict[str, Any]:
             inliers = np.asarray(geometry.inlier_matches, int).reshape(-1, 2)
             ends = points[first][inliers[:, 0]], points[second][inliers[:, 1]]
             still = int((np.linalg.norm(ends[0] - ends[1], axis=1) < _STILL_PX).sum())
-            for here, there, own, other in ((first, second, *ends), (second, first, *ends[::-1])):
+            for here, there, points_here, points_there in (
+                (first, second, *ends),
+                (second, first, *ends[::-1]),
+            ):
                 view = views[names[here]]
                 view |= {"matched": view["matched"] + len(inliers), "still": view["still"] + still}
                 if len(inliers) > view["most"]:
-                    lines = np.hstack([own, other]).round(1).tolist()[:200]
+                    lines = np.hstack([points_here, points_there]).round(1).tolist()[:200]
                     view |= {"most": len(inliers), "best": names[there], "lines": lines}
     return views
 

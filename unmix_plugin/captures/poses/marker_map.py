@@ -55,8 +55,8 @@ class MarkerMap:
         local = transformed(self.camera_from_world[seen.view], corners[seen.marker])
         ideal, pixels = local[..., :2] / np.maximum(local[..., 2:], 1e-3), np.empty(local[..., :2].shape)
         for index, lens in enumerate(self.lenses):
-            own = seen.sensor[seen.view] == index
-            pixels[own] = lens.pixels_of(ideal[own].reshape(-1, 2)).reshape(-1, 4, 2)
+            of_sensor = seen.sensor[seen.view] == index
+            pixels[of_sensor] = lens.pixels_of(ideal[of_sensor].reshape(-1, 2)).reshape(-1, 4, 2)
         return pixels - seen.corners
 
     def misses(self, seen: Seen) -> Float64[np.ndarray, " S"]:

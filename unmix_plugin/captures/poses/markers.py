@@ -168,10 +168,10 @@ class _Chain:
         self._focal = np.array([lens.focal_px[0] for lens in lenses])[seen.sensor][seen.view]
         self._ideal = np.empty_like(seen.corners)
         for index in np.unique(seen.sensor[seen.view]).tolist():
-            own = seen.sensor[seen.view] == index
-            ideal = lenses[index].ideal_of(seen.corners[own].reshape(-1, 2))
+            of_sensor = seen.sensor[seen.view] == index
+            ideal = lenses[index].ideal_of(seen.corners[of_sensor].reshape(-1, 2))
             assert ideal is not None  # `_gather` leaves out what a lens can't follow
-            self._ideal[own] = ideal.reshape(-1, 4, 2)
+            self._ideal[of_sensor] = ideal.reshape(-1, 4, 2)
         self._squares = np.stack([_square_poses(corners) for corners in self._ideal])
         """Both poses of each sighting, camera from marker."""
         self._placed = np.full((len(seen.numbers), 4, 4), np.nan)
@@ -351,9 +351,9 @@ def _pose_set(
     notes = [f"{gave}, corners off by {error:.2f} px (root mean square)"]
     if missing := [name for name in sightings if name not in cameras]:
         notes.append(f"views without enough markers: {name_some(missing)}")
-    if left := int((~kept).sum()):
-        notes.append(f"{counted(left, 'sighting')} of markers left out as not fitting the others")
-    focal = [f"{lens.focal_px[0]:.1f}" for lens, own in zip(found.lenses, free, strict=True) if own]
+    if unused := int((~kept).sum()):
+        notes.append(f"{counted(unused, 'sighting')} of markers left out as not fitting the others")
+    focal = [f"{lens.focal_px[0]:.1f}" for lens, is_free in zip(found.lenses, free, strict=True) if is_free]
     notes += [f"focal length estimated from the markers: {', '.join(focal)} px"] if focal else []
     notes += [how_up, _how_large(marker_size)]
     return PoseSet(
@@ -392,11 +392,11 @@ def _stand_on_markers(
     x = across - (across @ up) * up
     x /= np.linalg.norm(x)
     rotation = np.stack([x, np.cross(up, x), up])
-    way = Placement(rotation, -rotation @ points.mean(axis=0), marker_size / float(np.median(sides)))
+    to_board = Placement(rotation, -rotation @ points.mean(axis=0), marker_size / float(np.median(sides)))
     if group.sum() < 2 <= len(corners):
-        return way, None, "no two markers lie in one plane, so they do not tell up"
+        return to_board, None, "no two markers lie in one plane, so they do not tell up"
     how_up = f"up is square to the plane of {counted(int(group.sum()), 'marker')}"
-    return way, np.array([0.0, 0.0, 1.0]), how_up
+    return to_board, np.array([0.0, 0.0, 1.0]), how_up
 
 
 def metric_poses(poses: PoseSet, sightings: Sightings, marker_size: float) -> PoseSet:
@@ -424,11 +424,11 @@ def _located(
     seen: Sequence[tuple[PosedCamera, Float64[np.ndarray, "4 2"]]],
 ) -> Float64[np.ndarray, "4 3"] | None:
     """Corners where rays of cameras meet, None where they don't; cameras that disagree are left out."""
-    left = list(seen)
-    while len(left) > 1 and (met := where_rays_meet(left)) is not None:
-        points, away = met
+    agreeing = list(seen)
+    while len(agreeing) > 1 and (meeting := where_rays_meet(agreeing)) is not None:
+        points, away = meeting
         misses = np.sqrt((away**2).mean(axis=1))
         if np.max(misses) < 2.0 * _OUTLIER_PX:
             return points
-        left.pop(int(np.argmax(np.nan_to_num(misses, nan=np.inf))))
+        agreeing.pop(int(np.argmax(np.nan_to_num(misses, nan=np.inf))))
     return None

@@ -65,8 +65,8 @@ def read_metashape(path: Path, root: _Element) -> PoseSet:
     worlds: dict[str | None, Float64[np.ndarray, "4 4"]] = {None: np.eye(4)}
     owners = [(None, chunk), *((part.get("id"), part) for part in chunk.iterfind("components/component"))]
     for component, owner in owners:
-        if (own := owner.find("transform")) is not None:
-            worlds[component] = _similarity(own, str(path))
+        if (element := owner.find("transform")) is not None:
+            worlds[component] = _similarity(element, str(path))
     aligned = _of_one_world(_aligned(chunk, path, notes), worlds, notes)
     used = {camera.sensor for camera in aligned}
     lenses: dict[str | None, Lens | None] = {}
@@ -188,10 +188,10 @@ def _beside_master(
     offsets: Mapping[str | None, Float64[np.ndarray, "4 4"]],
 ) -> Float64[np.ndarray, "4 4"] | None:
     """The matrix of a camera by its master's. The master of a shot may have another sensor than the system's."""
-    own, of_master = offsets.get(camera.get("sensor_id")), offsets.get(master.get("sensor_id"))
-    if own is None or of_master is None or camera.get("sensor_id") == master.get("sensor_id"):
+    of_camera, of_master = offsets.get(camera.get("sensor_id")), offsets.get(master.get("sensor_id"))
+    if of_camera is None or of_master is None or camera.get("sensor_id") == master.get("sensor_id"):
         return None
-    return matrix @ np.linalg.inv(of_master) @ own
+    return matrix @ np.linalg.inv(of_master) @ of_camera
 
 
 def _similarity(element: _Element, where: str) -> Float64[np.ndarray, "4 4"]:

@@ -39,11 +39,11 @@ _AFFINITY_TOLERANCE = 1e-6
 
 def find_orientations(folder: Path) -> list[Path]:
     """Orientation files of a folder, otherwise of the only folder `Ori-...` in it."""
-    own = sorted(folder.glob(f"{_PREFIX}*.xml"))
+    inside = sorted(folder.glob(f"{_PREFIX}*.xml"))
     below = [sorted(place.glob(f"{_PREFIX}*.xml")) for place in sorted(folder.glob("Ori-*"))]
     below = [files for files in below if files]
-    if own or not below:
-        return own
+    if inside or not below:
+        return inside
     if len(below) > 1:
         names = ", ".join(files[0].parent.name for files in below)
         raise CaptureError(f"{folder} has several orientations: {names}; give the folder of one")

@@ -67,11 +67,11 @@ class PosedCamera:
         rays = np.column_stack([ideal, np.ones(len(ideal))]) @ FLIP @ self.camera_to_world[:, :3].T
         return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
-    def moved(self, way: Placement) -> PosedCamera:
+    def moved(self, placement: Placement) -> PosedCamera:
         """The camera in the world that a similarity leads to."""
         pose = self.camera_to_world
-        place = way.to_scene(pose[:, 3])
-        return replace(self, camera_to_world=np.column_stack([way.rotation @ pose[:, :3], place]))
+        place = placement.to_scene(pose[:, 3])
+        return replace(self, camera_to_world=np.column_stack([placement.rotation @ pose[:, :3], place]))
 
 
 @dataclass(frozen=True)
@@ -99,10 +99,10 @@ class PoseSet:
     warnings: tuple[str, ...] = ()
     """What may make the geometry wrong, one sentence each: reports begin with it."""
 
-    def moved(self, way: Placement) -> PoseSet:
+    def moved(self, placement: Placement) -> PoseSet:
         """Cameras and points in the world that a similarity leads to."""
-        cameras = {name: camera.moved(way) for name, camera in self.cameras.items()}
-        points = None if self.points is None else way.to_scene(self.points)
+        cameras = {name: camera.moved(placement) for name, camera in self.cameras.items()}
+        points = None if self.points is None else placement.to_scene(self.points)
         return replace(self, cameras=cameras, points=points)
 
 
@@ -148,23 +148,25 @@ def make_pose_set(
     lenses = dict.fromkeys(camera.lens for camera in unique.values() if camera.lens is not None)
     for lens in lenses:
         require_possible(lens, where)
-    said = [*notes, *(lens.note for lens in lenses if lens.note)]
+    all_notes = [*notes, *(lens.note for lens in lenses if lens.note)]
     scaled = scales[np.abs(scales - 1.0) > _SCALE_TOLERANCE]
     if len(scaled):
         low, high = scaled.min(), scaled.max()
         factor = f"{low:.4g}" if high - low <= 1e-3 * high else f"{low:.4g} to {high:.4g}"
         which = f"the rotations of {len(scaled)} of {len(scales)} cameras"
-        said.append(f"{which} were scaled by {factor}; made rigid, positions kept")
+        all_notes.append(f"{which} were scaled by {factor}; made rigid, positions kept")
     if repeated:
         listed = counted(len(repeated), "camera")
-        said.append(f"{listed} listed twice with the same pose: {name_some(repeated)}")
+        all_notes.append(f"{listed} listed twice with the same pose: {name_some(repeated)}")
     if offset.any():
-        said.append(f"coordinates are large: less the offset {', '.join(f'{value:.0f}' for value in offset)}")
+        all_notes.append(
+            f"coordinates are large: less the offset {', '.join(f'{value:.0f}' for value in offset)}"
+        )
     positions, colours = points if points is not None and len(points[0]) else (None, None)
     if positions is not None:
         good = (np.abs(positions) <= _GREATEST_POSITION).all(axis=1)  # false for NaN
         if not good.all():
-            said.append(
+            all_notes.append(
                 f"{(~good).sum()} sparse points are not finite, or more than 1e9 units away: left out"
             )
         positions, colours = positions[good] - offset, None if colours is None else colours[good]
@@ -178,7 +180,7 @@ def make_pose_set(
         colours,
         offset,
         None if up is None else up / np.linalg.norm(up),
-        notes=tuple(said),
+        notes=tuple(all_notes),
         warnings=tuple(warnings),
     )
 
@@ -237,15 +239,15 @@ def _fault(matrix: Float64[np.ndarray, "3 4"]) -> str | None:
         return "the matrix has numbers that are not finite"
     if np.abs(matrix).max() > _GREATEST_POSITION:
         return "the camera is more than 1e9 units away, or its rotation scaled by more"
-    left = matrix[:, :3]
-    lengths = np.linalg.norm(left, axis=0)
+    rotation = matrix[:, :3]
+    lengths = np.linalg.norm(rotation, axis=0)
     if lengths.max() < 1e-9:
         return "the rotation is all zeros"
-    gram = left.T @ left / np.mean(lengths**2)
+    gram = rotation.T @ rotation / np.mean(lengths**2)
     if np.abs(gram - np.eye(3)).max() > _SHEAR_TOLERANCE:
         axes = ", ".join(f"{length:.4g}" for length in lengths)
         return f"the rotation is sheared (its axes have lengths {axes})"
-    if np.linalg.det(left) < 0:
+    if np.linalg.det(rotation) < 0:
         return "the rotation is a mirror image (determinant below 0), so an axis has the wrong sign"
     return None
 

@@ -262,12 +262,12 @@ def _read_frames(
             notes.append("'from_na' is set: cameras have OpenCV's axes, as NeuS2 writes them")
             matrix[:, :3] = matrix[:, :3] @ FLIP
         model, terms = _terms_of_other_models(top | frame, where)
-        common, own = top, frame
+        common, of_frame = top, frame
         if terms:  # whose list is not that of the keys k1 to p2
-            common, own = (
+            common, of_frame = (
                 {key: one[key] for key in one if key != "distortion_params"} for one in (top, frame)
             )
-        given, lens = read_lens(common, own, place, faults), None
+        given, lens = read_lens(common, of_frame, place, faults), None
         if given is not None:
             if given.width is not None and given.height is not None:
                 size = (given.width, given.height)

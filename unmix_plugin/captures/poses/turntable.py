@@ -363,9 +363,9 @@ def _begin(evidence: Evidence, focal_px: float, sense: float) -> _Numbers:
         start.cameras[camera, column] = min(np.radians(degrees).tolist(), key=cost)
 
     for camera in range(count):
-        own = evidence.part(evidence.camera == camera)
-        best_of(camera, _PITCH, _PITCHES_DEG, own)
-        start.cameras[camera, :3] = _solve(start, own, [camera], steps=8, zoom=False).cameras[camera, :3]
+        at_place = evidence.part(evidence.camera == camera)
+        best_of(camera, _PITCH, _PITCHES_DEG, at_place)
+        start.cameras[camera, :3] = _solve(start, at_place, [camera], steps=8, zoom=False).cameras[camera, :3]
     pitch = start.cameras[:, _PITCH]
     distance = 1.0 / np.cos(pitch[0])
     start.cameras[:, 3] = np.log(distance * np.cos(pitch))
@@ -384,10 +384,10 @@ def _refuse_alike(evidence: Evidence, fits: int) -> None:
     if evidence.likeness <= _MOST_ALIKE or fits >= max(_LEAST_MATCHES, _LEAST_FIT * len(evidence.first)):
         return
     has_masks = len(evidence.touched) > 0
-    told = f"silhouettes overlap by {evidence.likeness:.1%}" if has_masks else "there are no masks"
+    silhouettes = f"silhouettes overlap by {evidence.likeness:.1%}" if has_masks else "there are no masks"
     raise CaptureError(
-        f"the axis can't be told, as all views are alike: {told}, and {fits} of {len(evidence.first)} points that were "
-        "matched and moved fit one; put something patterned on the turntable, or cut out the background"
+        f"the axis can't be told, as all views are alike: {silhouettes}, and {fits} of {len(evidence.first)} points "
+        "that were matched and moved fit one; put something patterned on the turntable, or cut out the background"
     )
 
 
@@ -400,11 +400,13 @@ def _refuse_unexplained(fitted: _Numbers, evidence: Evidence) -> None:
     limit = _MOST_OFF * float(np.hypot(*evidence.size))
     if off <= limit or fits >= max(_ENOUGH_MATCHES, _ENOUGH_FIT * len(matched)):
         return
-    told = f"a quarter of the outlines are off by more than {off:.2g} px (at most {limit:.2g} is expected), "
+    outlines_off = (
+        f"a quarter of the outlines are off by more than {off:.2g} px (at most {limit:.2g} is expected), "
+    )
     raise CaptureError(
-        f"the angles do not explain the pictures: {told * bool(len(compared))}{fits} of {len(matched)} matched "
-        "points fit; expected the object alone to turn before a camera and a background that stand still: check "
-        "--angles, and that --mask cuts out the object"
+        f"the angles do not explain the pictures: {outlines_off * bool(len(compared))}{fits} of {len(matched)} "
+        "matched points fit; expected the object alone to turn before a camera and a background that stand still: "
+        "check --angles, and that --mask cuts out the object"
     )
 
 

@@ -242,8 +242,8 @@ def _hulls(cv2: Any, masks: Sequence[Bool[np.ndarray, "H W"]]) -> Float64[np.nda
 def _likeness(masks: Bool[np.ndarray, "N H W"], camera: Int[np.ndarray, " N"]) -> float:
     overlaps = []
     for place in np.unique(camera):
-        own = masks[camera == place]
-        usual = own.mean(axis=0) >= 0.5
-        both, either = (own & usual).sum(axis=(1, 2)), (own | usual).sum(axis=(1, 2))
+        of_place = masks[camera == place]
+        usual = of_place.mean(axis=0) >= 0.5
+        both, either = (of_place & usual).sum(axis=(1, 2)), (of_place | usual).sum(axis=(1, 2))
         overlaps.append(both / np.maximum(either, 1))
     return float(np.concatenate(overlaps).mean())

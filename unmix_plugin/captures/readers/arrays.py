@@ -312,8 +312,14 @@ def _numbers_in_text(value: Any) -> Any:
 
 def describes_image(name: str) -> bool:
     """Whether an array of this name, with its groups, may say something of an image beside it."""
-    own = name.rpartition("/")[2].lower()
-    return own in _AXES or own in _SIDES or is_exposure(own) or says_bands(own) or bool(NAMES.fullmatch(own))
+    last = name.rpartition("/")[2].lower()
+    return (
+        last in _AXES
+        or last in _SIDES
+        or is_exposure(last)
+        or says_bands(last)
+        or bool(NAMES.fullmatch(last))
+    )
 
 
 def _lists_bands(array: FoundArray) -> bool:
@@ -340,8 +346,8 @@ def _lists_beside(arrays: Sequence[FoundArray], image: FoundArray) -> dict[str, 
         numbers = _texts(array) if is_text else _unpacked(array)
         if len(numbers) not in lengths:
             continue
-        own = plain_names(array.attributes)
-        unit = next((array.all_attributes[own[key]] for key in ("units", "unit") if key in own), None)
+        plain = plain_names(array.attributes)
+        unit = next((array.all_attributes[plain[key]] for key in ("units", "unit") if key in plain), None)
         if is_exposure(name):
             beside[name] = numbers if unit is None else [f"{number} {unit}" for number in numbers]
         elif isinstance(numbers[0], str):

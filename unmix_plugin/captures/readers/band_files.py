@@ -102,8 +102,10 @@ def stack_bands(parts: Sequence[Cube], path: Path) -> Cube:
         remarks.append(Remark.of(Code.GAINS_OF_SOME_FILES))
     each = [part.linear or Linear(np.ones(1), np.zeros(1), "") for part in parts]
     gains, offsets = (np.concatenate([getattr(one, name) for one in each]) for name in ("gains", "offsets"))
-    own = [replace(part, no_data=tuple(number for number in part.no_data if number != 0)) for part in parts]
-    differ = len({(repr(part.no_data), part.valid_range) for part in own}) > 1
+    without_zeros = [
+        replace(part, no_data=tuple(number for number in part.no_data if number != 0)) for part in parts
+    ]
+    differ = len({(repr(part.no_data), part.valid_range) for part in without_zeros}) > 1
     of_all = [number for part in parts for number in part.no_data if number == 0 or not differ]
 
     return replace(
@@ -112,7 +114,7 @@ def stack_bands(parts: Sequence[Cube], path: Path) -> Cube:
         shape=(*first.shape[:2], len(parts)),
         dtype=np.result_type(*(part.dtype for part in parts)),
         numbers=None,
-        parts=tuple(own),
+        parts=tuple(without_zeros),
         bands=_table_of([part.bands for part in parts]),
         linear=replace(stated[0], gains=gains, offsets=offsets) if stated else None,
         no_data=tuple(dict.fromkeys(of_all)),
@@ -165,8 +167,12 @@ def _other_entries(parts: Sequence[Cube]) -> dict[str, Any]:
         same["header"] = {key: value for key, value in headers[0].items() if (key, value) in shared}
     facts = [part.facts for part in parts]
     differ = [
-        {key: value for key, value in own.items() if any(repr(one.get(key)) != repr(value) for one in facts)}
-        for own in facts
+        {
+            key: value
+            for key, value in of_part.items()
+            if any(repr(one.get(key)) != repr(value) for one in facts)
+        }
+        for of_part in facts
     ]
     return same | ({"parts": differ} if any(differ) else {})
 
@@ -200,7 +206,7 @@ def _exposure_of_bands(parts: Sequence[Cube], remarks: list[Remark]) -> Exposure
         return Exposure(each[0].time, None if without else each[0].gain, f_number)
     # As if all bands had the f-number of the first.
     seconds = [
-        time[0] * gain[0] * (f_numbers[0] / own) ** 2
-        for time, gain, own in zip(times, gains, f_numbers, strict=True)
+        time[0] * gain[0] * (f_numbers[0] / f_number_of_band) ** 2
+        for time, gain, f_number_of_band in zip(times, gains, f_numbers, strict=True)
     ]
     return Exposure(Factor(tuple(seconds)), None, f_number)

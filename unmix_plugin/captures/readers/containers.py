@@ -153,8 +153,8 @@ def open_hdf5(path: Path, options: ReadOptions) -> Cube:
     def visit(group: Any, inside: str, inherited: dict[str, Any]) -> None:
         # Not by `visititems`, which never ends where a damaged tree of names leads back to itself.
         seen.add(group)
-        own = _attributes(path, group)
-        inherited = own | {key: value for key, value in inherited.items() if key not in own}
+        attributes = _attributes(path, group)
+        inherited = attributes | {key: value for key, value in inherited.items() if key not in attributes}
         for link in group:
             if not isinstance(group.get(link, getlink=True), h5py.HardLink) or (item := group[link]) in seen:
                 continue
@@ -355,20 +355,20 @@ def _found_in_matlab(
         return []
     _, _, at, end = _tag(head, order, 0)
     (flags,) = struct.unpack_from(order + "I", head, at)
-    if (own := flags & 0xFF) not in (*_CELLS_TO_SPARSE, *_CLASSES):
+    if (class_number := flags & 0xFF) not in (*_CELLS_TO_SPARSE, *_CLASSES):
         return []
     _, size, at, end = _tag(head, order, end)
     shape = struct.unpack_from(f"{order}{size // 4}i", head, at)
     _, size, at, end = _tag(head, order, end)
     name = head[at : at + size].decode("utf-8", "replace")
-    if own not in _CLASSES or flags & _IS_COMPLEX:
-        texts = _matlab_texts(head, order, end, shape) if own == _LETTERS else []
+    if class_number not in _CLASSES or flags & _IS_COMPLEX:
+        texts = _matlab_texts(head, order, end, shape) if class_number == _LETTERS else []
         found = np.array(texts) if texts else np.zeros((), UNREAD)
         return [FoundArray(name, found.shape, found.dtype, Held(found))] if name else []
     kind, size, at, _ = _tag(head, order, end)
     if kind not in _STORED or min(shape, default=-1) < 0:
         raise ValueError(f"variable '{name}' has the type {kind} and the shape {shape}")
-    stored, dtype, offset = np.dtype(order + _STORED[kind]), np.dtype(_CLASSES[own]), start + at
+    stored, dtype, offset = np.dtype(order + _STORED[kind]), np.dtype(_CLASSES[class_number]), start + at
     if prod(shape) * stored.itemsize != size or at + size > length:
         raise ValueError(f"variable '{name}' of {shape} {stored.name} has {size} bytes")
     if packed is None:
@@ -401,15 +401,15 @@ def _tag(head: bytes, order: str, position: int) -> tuple[int, int, int, int]:
 
 def _unpack(path: Path, numbers: np.ndarray, name: str, offset: int, packed: tuple[int, int]) -> None:
     """The numbers of a compressed variable, unpacked piece by piece to where they stay, and no more than it needs."""
-    start, left = packed
+    start, unread = packed
     target, at, unpacking = numbers.reshape(-1, order="F").view(np.uint8), -offset, zlib.decompressobj()
     with path.open("rb") as file:
         file.seek(start)
         while at < len(target):
             part = unpacking.unconsumed_tail
             if not part:
-                part = file.read(min(_PIECE_BYTES, left))
-                left -= len(part)
+                part = file.read(min(_PIECE_BYTES, unread))
+                unread -= len(part)
             piece = unpacking.decompress(part, _PIECE_BYTES)
             if not part and not piece:
                 raise CaptureError(f"{path}: variable '{name}' is cut short; copy the file again")

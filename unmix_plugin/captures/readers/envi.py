@@ -126,14 +126,14 @@ def described_image(header_path: Path) -> Path | None:
 
 def _described(file: Cube, header_path: Path, header: dict[str, str]) -> Cube:
     """The file with bands, gains, exposure and other facts of a header; what the file says itself fills gaps."""
-    num_bands, own, remarks = file.shape[2], file.bands, list(file.remarks)
+    num_bands, bands_of_file, remarks = file.shape[2], file.bands, list(file.remarks)
     if unread := header.pop("", "").splitlines():
         first = repr(unread[0][:80])
         remarks.append(Remark.of(Code.HEADER_LINES_UNREAD, lines=len(unread), first=first))
     stated = state_bands({key: header[key] for key in _OF_BANDS if key in header}, "header field")
     bands = check_bands(stated, num_bands, remarks)
-    if bands.wavelengths_nm is None and own.wavelengths_nm is not None:
-        bands = replace(own, bad=own.bad if bands.bad is None else bands.bad)
+    if bands.wavelengths_nm is None and bands_of_file.wavelengths_nm is not None:
+        bands = replace(bands_of_file, bad=bands_of_file.bad if bands.bad is None else bands.bad)
     linear = state_linear(
         header_path, num_bands, header, where="header field", format_of=Format.ENVI, remarks=remarks
     )
@@ -159,7 +159,7 @@ def _described(file: Cube, header_path: Path, header: dict[str, str]) -> Cube:
         file,
         shape=(lines - dark_lines, *file.shape[1:]),
         dark_lines=dark_lines,
-        bands=bands if bands.names is not None else replace(bands, names=own.names),
+        bands=bands if bands.names is not None else replace(bands, names=bands_of_file.names),
         linear=linear or file.linear,
         no_data=tuple(dict.fromkeys((*no_data, *file.no_data))),
         remarks=tuple(remarks),

@@ -99,10 +99,10 @@ def open_exr(path: Path, options: ReadOptions) -> Cube:
         remarks.append(Remark.of(Code.PARTS_LEFT_OUT, names=names))
     windows = {one.part: _window(parts[one.part].header, "dataWindow") for one in chosen}
     is_partial = False
-    for index, own in windows.items():
-        low, high = _on_both(own, frame)
+    for index, window_of_part in windows.items():
+        low, high = _on_both(window_of_part, frame)
         if (high <= low).any():
-            has, whole = ((window - [[0], [1]]).tolist() for window in (own, frame))
+            has, whole = ((window - [[0], [1]]).tolist() for window in (window_of_part, frame))
             raise CaptureError(
                 f"{path}: its data window {has} lies outside of the picture {whole} (left and top, right and bottom); "
                 "expected a part of it: render it again"
@@ -110,7 +110,7 @@ def open_exr(path: Path, options: ReadOptions) -> Cube:
         is_partial |= bool((low > frame[0]).any() or (high < frame[1]).any())
         # The library decodes all channels of a part; what is taken is put on the picture.
         a_pixel = sum(channel.dtype.itemsize for channel in channels if channel.part == index)
-        allow_decoded(path, max(_area(own), _area(frame)) * a_pixel, CaptureError)
+        allow_decoded(path, max(_area(window_of_part), _area(frame)) * a_pixel, CaptureError)
     dtype = np.result_type(*(channel.dtype for channel in chosen))
     attributes = {
         name: value
@@ -219,8 +219,8 @@ def _choose(
         there = ", ".join(layers + names)[:300]
         raise CaptureError(f"{path}: no layer, part or channel '{wanted}'; it has {there}")
     if not spectral:
-        own = [channel.name for channel in channels if channel.part == channels[0].part]
-        bands = [name for name in own if name.rpartition(".")[2] not in _ALPHA] or own
+        of_first = [channel.name for channel in channels if channel.part == channels[0].part]
+        bands = [name for name in of_first if name.rpartition(".")[2] not in _ALPHA] or of_first
         bands = _in_order(bands)
         found, table = wavelengths_in_names(bands), BandTable(names=tuple(bands))
         if found is not None:

@@ -126,12 +126,12 @@ def open_tiff(path: Path, options: ReadOptions) -> Cube:
         texts = dict.fromkeys(_text(page, _GDAL_METADATA) for page in (first, top))
         items = next(filter(None, (gdal_items(text, remarks) for text in texts)), {})
         entries = gdal_entries(items)
-        said = [state_bands(entries, "GDAL metadata")]
-        said += [state_bands(_described(page), "image description") for page in (first, top)]
+        statements = [state_bands(entries, "GDAL metadata")]
+        statements += [state_bands(_described(page), "image description") for page in (first, top)]
         from_pages = _from_pages(stack.pages, file.imagej_metadata or {})
         of_page = len(stack.pages) > 1  # a description of one wavelength may be that of its page alone
-        said = [one for one in said if not (of_page and len(one.centres or ()) == 1)]
-        stated = next((one for one in said if one.centres or one.names), from_pages)
+        statements = [one for one in statements if not (of_page and len(one.centres or ()) == 1)]
+        stated = next((one for one in statements if one.centres or one.names), from_pages)
         stack = _with_fill(stack, gdal_number(_text(first, _GDAL_NODATA)), remarks)
         on_map = any(tag in first.tags for tag in _GEO_TAGS)
         masks = _mask_pages(path, file, first)
@@ -434,10 +434,10 @@ def _described(page: TiffPage) -> dict[str, Any]:
     known = [unit for unit in units if unit and nm_per_unit(unit)]
     of_items = {unit.lower() for _, unit in found if unit}
     if len({nm_per_unit(unit) for unit in [*known, *sorted(of_items)]}) > 1:
-        said = ", ".join(dict.fromkeys(unit for unit in (*known, *sorted(of_items))))
+        units_found = ", ".join(dict.fromkeys(unit for unit in (*known, *sorted(of_items))))
         raise CaptureError(
-            f"{page.parent.filename}: the description gives wavelengths in several units ({said}); correct it, or give "
-            "them yourself (--wavelengths)"
+            f"{page.parent.filename}: the description gives wavelengths in several units ({units_found}); correct it, "
+            "or give them yourself (--wavelengths)"
         )
     return {"wavelength": [number for number, _ in found], "wavelength units": known[0] if known else ""}
 

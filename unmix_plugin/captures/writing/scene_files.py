@@ -196,12 +196,14 @@ def _transforms_json(
     """
     bands = np.unique(np.concatenate([plan.sensors[view.sensor].centers_nm for view in views]))
     facts = [_facts(plan, view, written, bands) for view, written in zip(views, seen, strict=True)]
-    shared = {key: value for key, value in facts[0].items() if all(own.get(key) == value for own in facts)}
+    shared = {
+        key: value for key, value in facts[0].items() if all(of_frame.get(key) == value for of_frame in facts)
+    }
     frames = []
     for written, known in zip(seen, facts, strict=True):
-        own = {key: value for key, value in known.items() if key not in shared}
+        of_frame = {key: value for key, value in known.items() if key not in shared}
         pose = matrix_entry(written.camera.camera_to_world)
-        frames.append({**written.record.paths, **own, "transform_matrix": pose})
+        frames.append({**written.record.paths, **of_frame, "transform_matrix": pose})
 
     # Widths of all bands as the files tell them, if all are known and bands are not averaged.
     known_nm: dict[float, float] = {}
