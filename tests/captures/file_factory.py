@@ -169,7 +169,7 @@ def check_file(file: Cube, **expected: Any) -> None:
                 assert bands.bad is not None
                 assert np.flatnonzero(bands.bad).tolist() == value
             case "evidence":
-                assert value in bands.evidence
+                assert value in bands.source
             case "warning" | "note":
                 sentences_of = {"warning": warnings_of, "note": notes_of}[name]
                 assert any(value in text for text in sentences_of(file)), sentences_of(file)

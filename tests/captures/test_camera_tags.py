@@ -61,7 +61,7 @@ def test_a_band_has_its_centre_and_width_or_none_is_made_up(tags, centre, width)
     if table is not None:
         assert table.wavelengths_nm == [centre]
         assert (table.fwhm_nm is None) if width is None else (table.fwhm_nm == [width])
-        assert next(iter(tags)).rpartition(":")[2] in table.evidence
+        assert next(iter(tags)).rpartition(":")[2] in table.source
 
 
 def test_numbers_of_10_bits_of_a_sequoia_are_as_bright_as_those_of_16():

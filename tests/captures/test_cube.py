@@ -29,13 +29,13 @@ def test_a_stack_keeps_what_its_parts_share_and_lists_the_rest(tmp_path):
     stack = stack_bands(parts, tmp_path)
     each = [{"exposure_s": 0.1, "slot": 1}, {"exposure_s": 0.2}]
     assert stack.facts == {"camera": "a", "exposure_s": [0.1, 0.2], "parts": each}
-    assert (stack.bands.evidence, present(stack.linear).scale) == ("test", None)
+    assert (stack.bands.source, present(stack.linear).scale) == ("test", None)
     np.testing.assert_array_equal(stack.read(slice(1, 2), np.array([1, 0]))[0, 0], [2, 1])
     alike = stack_bands([part(tmp_path, 1, scale=3.0), part(tmp_path, 2, scale=3.0)], tmp_path)
     assert (present(alike.linear).scale, alike.facts, warnings_of(alike)) == (3.0, {}, [])
     assert "only some of the files of one view state gains" in warnings_of(stack)[0]
     mixed = stack_bands([*parts, replace(part(tmp_path, 3), bands=BandTable())], tmp_path).bands
-    assert (mixed.wavelengths_nm, mixed.evidence) == (None, "only some of the files give wavelengths")
+    assert (mixed.wavelengths_nm, mixed.source) == (None, "only some of the files give wavelengths")
 
 
 @pytest.mark.parametrize(

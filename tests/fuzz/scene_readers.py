@@ -13,7 +13,7 @@ from PIL import Image
 
 from tests.fuzz.mutation import Reader, mutate_json, mutate_png
 from tests.scenes.scene_factory import look_at
-from unmix_plugin.captures.poses.turntable_evidence import parse_angles
+from unmix_plugin.captures.poses.turntable_observations import parse_angles
 from unmix_plugin.captures.wavelengths import parse_wavelengths
 from unmix_plugin.errors import ConfigError, SceneError, SpectrumError
 from unmix_plugin.formats.libraries import read_library

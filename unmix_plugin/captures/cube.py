@@ -56,7 +56,7 @@ class BandTable:
 
     wavelengths_nm: Float64[np.ndarray, " B"] | None = None
     """Band centres in nm, in the order of the file."""
-    evidence: str = "the file gives no wavelengths"
+    source: str = "the file gives no wavelengths"
     """Where the wavelengths were found and in which unit, for people: `header field 'wavelength', Micrometers`."""
     fwhm_nm: Float64[np.ndarray, " B"] | None = None
     """Full width at half maximum of each band, nm."""

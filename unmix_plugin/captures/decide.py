@@ -62,7 +62,7 @@ class Saturation:
     """Stored number from which a pixel is saturated; None where none is known."""
 
     stored: float | None
-    evidence: str
+    reason: str
     """For people."""
 
 
@@ -175,7 +175,7 @@ class Scale:
     """Calibrated value that is written as 1."""
 
     value: float
-    evidence: str
+    reason: str
     """For people."""
     is_given: bool = False
     """Whether the user names it."""

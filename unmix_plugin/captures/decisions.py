@@ -41,7 +41,7 @@ def decisions_of(
         Decision(
             "scale",
             f"{plan.scale.value:g} is written as 1",
-            {"sampled values above": above, "from": plan.scale.evidence},
+            {"sampled values above": above, "from": plan.scale.reason},
             "views that are far brighter than most, which it does not follow",
             "--scale",
         )
@@ -67,11 +67,11 @@ def _of_sensor(where: str, sensor: SensorPlan, options: ProcessOptions) -> Itera
         ("white", "white reference", "bands in which it is saturated, dark, or not above the dark frame"),
     ):
         if key in facts:
-            evidence = {"file": facts[key]["file"], "use": facts[key]["use"]}
+            used = {"file": facts[key]["file"], "use": facts[key]["use"]}
             yield Decision(
                 f"{what}{where}",
                 "subtracted" if key == "dark" else "divided by",
-                evidence,
+                used,
                 against,
                 f"--{key}",
             )
@@ -85,11 +85,11 @@ def _of_sensor(where: str, sensor: SensorPlan, options: ProcessOptions) -> Itera
         {},
         "a time, gain or f-number that one file states and another lacks; values that are reflectance already",
     )
-    stored, evidence = sensor.saturation.stored, sensor.saturation.evidence
+    stored, reason = sensor.saturation.stored, sensor.saturation.reason
     yield Decision(
         f"saturation{where}",
         UNDECIDED if stored is None else f"from {stored:g}",
-        {"from": evidence},
+        {"from": reason},
         "numbers that are not whole, or none that crowd at the greatest",
         "--saturation",
     )

@@ -322,9 +322,9 @@ def check_bands(stated: StatedBands, num_bands: int, remarks: list[Remark]) -> B
     A wavelength of 0 marks a band that is not used, as PRISMA's files have it: the band counts as bad.
     """
     names = _fitting("names of bands", stated.names, num_bands, remarks)
-    centres, evidence, factor, unused = None, BandTable.evidence, None, np.zeros(num_bands, bool)
+    centres, source, factor, unused = None, BandTable.source, None, np.zeros(num_bands, bool)
     if stated.centres is not None:
-        evidence = _UNUSABLE
+        source = _UNUSABLE
         values = _numbers(f"{stated.where}: wavelengths", stated.centres, num_bands, remarks)
         if values is not None:
             unused = values == 0 if (values > 0).any() else unused
@@ -336,12 +336,12 @@ def check_bands(stated: StatedBands, num_bands: int, remarks: list[Remark]) -> B
                 # An unused band gets the wavelength of the nearest band that is used, of two the first.
                 middles = np.convolve(np.flatnonzero(~unused), (0.5, 0.5), "valid")
                 nearest = np.searchsorted(middles, np.arange(num_bands))
-                centres, evidence = used[nearest] * factor, found
-                evidence += f"; {int(unused.sum())} are 0: bands that are not used" if unused.any() else ""
+                centres, source = used[nearest] * factor, found
+                source += f"; {int(unused.sum())} are 0: bands that are not used" if unused.any() else ""
     named_fwhm = None
     named = None if centres is not None or names is None else wavelengths_in_names(list(map(str, names)))
     if named is not None and names is not None:
-        centres, evidence = named[0], f"names of bands, such as {names[0]!r}: {named[1]}"
+        centres, source = named[0], f"names of bands, such as {names[0]!r}: {named[1]}"
         named_fwhm = named[2] if stated.fwhm is None else None
         factor = nm_per_unit((stated.unit or "").strip()) or 1.0
     if centres is not None and (np.diff(centres[~unused]) == 0).any():
@@ -359,7 +359,7 @@ def check_bands(stated: StatedBands, num_bands: int, remarks: list[Remark]) -> B
     good = _numbers("marks of bad bands", stated.good, num_bands, remarks)
     bad = unused if good is None else (good == 0) | unused
     marks = None if good is None and not unused.any() else bad
-    return BandTable(centres, evidence, fwhm, marks, None if names is None else tuple(map(str, names)))
+    return BandTable(centres, source, fwhm, marks, None if names is None else tuple(map(str, names)))
 
 
 def _widths_nm(
@@ -411,7 +411,7 @@ def _numbers(
 def _nm_per_stated(
     values: np.ndarray, used: np.ndarray, stated: StatedBands
 ) -> tuple[float, str] | tuple[None, Remark]:
-    """How many nm one of the file's unit is, and the evidence; None and why where wavelengths can't be true.
+    """How many nm one of the file's unit is, and the source; None and why where wavelengths can't be true.
 
     Args:
         values: One number a band.
@@ -424,20 +424,20 @@ def _nm_per_stated(
 
     facts = {"entry": stated.where, "low": f"{low:g}", "high": f"{high:g}"}
     unit = (stated.unit or "").strip()
-    factor, evidence = nm_per_unit(unit), f"{stated.where}, {unit}"
+    factor, source = nm_per_unit(unit), f"{stated.where}, {unit}"
     if factor is None and unit.lower() in ("", "unknown"):
         if are_band_numbers(values):
             first = f"{values[0]:g}"
             return None, Remark.of(Code.WAVELENGTHS_COUNT_BANDS, **facts | {"low": first})
         factor = next((f for f in (1.0, 1e3) if is_plausible(f)), None)
         taken = "nm" if factor == 1.0 else "micrometres"
-        evidence = f"{stated.where}, no unit: {low:g} to {high:g} taken as {taken}"
+        source = f"{stated.where}, no unit: {low:g} to {high:g} taken as {taken}"
     if factor is None:
         given = f"the unit {unit!r}" if unit else "no unit"
         return None, Remark.of(Code.WAVELENGTHS_WITHOUT_UNIT, **facts, unit=given)
     if not is_plausible(factor):
         return None, Remark.of(Code.WAVELENGTHS_IMPOSSIBLE, **facts, unit=unit)
-    return factor, evidence
+    return factor, source
 
 
 # Exposure time and gain.

@@ -31,7 +31,7 @@ from unmix_plugin.captures.poses.marker_detection import (
 from unmix_plugin.captures.poses.markers import metric_poses, poses_from_markers
 from unmix_plugin.captures.poses.pose_set import PoseSet
 from unmix_plugin.captures.poses.turntable import poses_from_turntable
-from unmix_plugin.captures.poses.turntable_evidence import parse_angles
+from unmix_plugin.captures.poses.turntable_observations import parse_angles
 from unmix_plugin.captures.posing import lens_of_view
 from unmix_plugin.captures.writing.view_files import FULL_SCALE, ViewRecord
 from unmix_plugin.errors import CaptureError

@@ -14,7 +14,7 @@ import tyro
 from unmix_plugin.captures.cube import Axes, Capture, ReadOptions
 from unmix_plugin.captures.poses.estimation import require_pycolmap
 from unmix_plugin.captures.poses.marker_detection import parse_family, require_opencv
-from unmix_plugin.captures.poses.turntable_evidence import parse_angles
+from unmix_plugin.captures.poses.turntable_observations import parse_angles
 from unmix_plugin.errors import CaptureError, ConfigError, did_you_mean
 
 _LAYOUTS = {

@@ -126,7 +126,7 @@ class SensorPlan:
             for index, band in sorted(self.bands.dropped.items())
         ]
         facts = {
-            "saturation": {"stored": self.saturation.stored, "evidence": self.saturation.evidence},
+            "saturation": {"stored": self.saturation.stored, "evidence": self.saturation.reason},
             **self.references_used,
             "wavelengths": self.bands.source,
             "dropped_bands": dropped,
@@ -154,7 +154,7 @@ class Plan:
 
     @property
     def decisions(self) -> dict[str, Any]:
-        """With their evidence, as JSON-able values."""
+        """With their reasons, as JSON-able values."""
         from unmix_plugin.spectral.colour.conversion import describe_colour
 
         each = {}
@@ -168,7 +168,7 @@ class Plan:
                 **sensor.to_json(),
                 "background": None if rule is None else rule.evidence,
             }
-        scale = {"calibrated": self.scale.value, "evidence": self.scale.evidence}
+        scale = {"calibrated": self.scale.value, "evidence": self.scale.reason}
         return {"scale": scale, "mask": self.mask, "sensors": each}
 
 

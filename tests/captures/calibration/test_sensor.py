@@ -142,7 +142,7 @@ def test_a_rim_without_a_measurement_hides_no_saturation():
     assert saturation_of(file_of(counts)).stored == 4095.0
     found = saturation_of(file_of(np.full_like(counts, np.nan)))
     assert found.stored is None
-    assert "no sampled pixel has a measurement" in found.evidence
+    assert "no sampled pixel has a measurement" in found.reason
 
 
 def white_of(counts: np.ndarray, **facts):

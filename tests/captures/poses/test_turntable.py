@@ -13,7 +13,7 @@ from unmix_plugin.captures.poses import turntable as turntable_module
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet
 from unmix_plugin.captures.poses.turntable import poses_from_turntable
-from unmix_plugin.captures.poses.turntable_evidence import Turn, gather, parse_angles
+from unmix_plugin.captures.poses.turntable_observations import Turn, gather, parse_angles
 from unmix_plugin.errors import CaptureError, ConfigError
 
 cv2 = pytest.importorskip("cv2")

@@ -136,10 +136,10 @@ def stated_bands(files: Sequence[Cube], options: ProcessOptions) -> BandChoice:
     table, num_bands = files[0].bands, files[0].shape[2]
     if table.wavelengths_nm is None:
         raise CaptureError(
-            f"{files[0].path}: the wavelengths of its {num_bands} bands are unknown ({table.evidence}); give them with "
+            f"{files[0].path}: the wavelengths of its {num_bands} bands are unknown ({table.source}); give them with "
             f"--wavelengths{said_of_mosaic(files[0])}"
         )
-    choice = BandChoice(table.wavelengths_nm, table.evidence)
+    choice = BandChoice(table.wavelengths_nm, table.source)
     for file in files:
         if file.bands.bad is not None:
             choice = choice.without(file.bands.bad, BandFault.MARKED)

@@ -67,7 +67,7 @@ def calibrate_image(
         )
     options = ProcessOptions("cubes", file.path, Path(), white_reflectance=white_reflectance)
     references = find_references([view], known, options, given, [view])
-    choice, remarks = BandChoice(known, file.bands.evidence), []
+    choice, remarks = BandChoice(known, file.bands.source), []
     saturation = find_saturation(count_stored([file], np.arange(num_bands))) if references.whites else None
     for white in references.whites:
         stored = None if saturation is None else saturation.stored

@@ -137,8 +137,8 @@ def _with_given_bands(views: list[CaptureView], options: ReadOptions) -> list[Ca
     if len(given) != len(sensors):
         lenses = f"{len(sensors)} lenses ({', '.join(sensors)})"
         raise CaptureError(f"--wavelengths gives {len(given)} numbers for {lenses}; expected one a lens")
-    evidence = "given with --wavelengths"
-    tables = {sensor: BandTable(np.array([nm]), evidence) for sensor, nm in zip(sensors, given, strict=True)}
+    source = "given with --wavelengths"
+    tables = {sensor: BandTable(np.array([nm]), source) for sensor, nm in zip(sensors, given, strict=True)}
     return [replace(view, cube=replace(view.cube, bands=tables[view.sensor])) for view in views]
 
 

@@ -188,7 +188,7 @@ def find_nerfstudio(root: Path, options: ReadOptions) -> Capture:
             continue
         file = open_spectral_file(path, options)
         if file.bands.wavelengths_nm is None:
-            file = replace(file, bands=replace(file.bands, evidence=_NO_WAVELENGTHS))
+            file = replace(file, bands=replace(file.bands, source=_NO_WAVELENGTHS))
         picture = path if path.suffix in _SUFFIXES else None
         views.append(CaptureView(name, file, picture=picture, mask=mask, split=frame.split))
     found.refuse_missing("copy them into the folder, or drop the frames")

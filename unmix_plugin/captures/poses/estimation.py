@@ -162,9 +162,9 @@ def _best(
     best = max(models, key=lambda model: (model["registered"], -model["error_px"]), default=None)
     registered = 0 if best is None else best["registered"]
     if best is None or registered < max(_LEAST_VIEWS, _LEAST_SHARE * len(files)):
-        evidence, advice = _explain(views, files, folder)
+        findings, advice = _explain(views, files, folder)
         raise CaptureError(
-            f"poses of only {registered} of {len(files)} views could be estimated; expected at least half. {evidence}. "
+            f"poses of only {registered} of {len(files)} views could be estimated; expected at least half. {findings}. "
             f"Try: {advice}. {folder / _REPORT} and {folder / _DRAWN} show the worst views"
         )
     poses = read_colmap(Path(best["folder"]))
@@ -191,15 +191,15 @@ def _explain(views: dict[str, Any], files: Mapping[str, str], folder: Path) -> t
     if np.median(features) < _FEW_FEATURES:
         tries.sort(key=lambda what: what != _TEXTURE)
     worst = ", ".join(f"{names[file]} ({views[file]['most']})" for file in order[:_MOST_WORST])
-    evidence = (
+    findings = (
         f"In the mean of all bands, views have {np.median(features):.0f} features and share {np.median(usual):.0f} "
         f"with the view nearest to them (medians; {_FEW_FEATURES} and {_FEW_MATCHES} or more serve); the fewest: "
         f"{worst}"
     )
     if share > _MOSTLY_STILL:
         tries.sort(key=lambda what: what != _STILL)
-        evidence += f"; {share:.0%} of the matches stand still in the picture, as a background does"
-    lines = ["Poses could not be estimated.", "", evidence + ".", "", "Try, the most likely first:"]
+        findings += f"; {share:.0%} of the matches stand still in the picture, as a background does"
+    lines = ["Poses could not be estimated.", "", findings + ".", "", "Try, the most likely first:"]
     lines += [f"- {what}" for what in (*tries, _OTHER_POSES)]
     lines += ["", "view: features, matches with the view that shares most, its name"]
     for file in order:
@@ -207,7 +207,7 @@ def _explain(views: dict[str, Any], files: Mapping[str, str], folder: Path) -> t
         lines.append(f"{names[file]}: {view['features']}, {view['most']}, {partner}")
     (folder / _REPORT).write_text("\n".join(lines) + "\n", encoding="utf-8")
     _draw_worst(folder, views, order[:_MOST_WORST])
-    return evidence, "; ".join(tries)
+    return findings, "; ".join(tries)
 
 
 def _draw_worst(folder: Path, views: dict[str, Any], worst: Sequence[str]) -> None:

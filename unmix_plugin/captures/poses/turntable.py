@@ -1,10 +1,10 @@
 """Poses of an object that was turned in known steps before a camera that stood still.
 
 One axis explains all views, so few numbers are unknown: how the camera is turned against the axis, its focal length,
-and for each further place of the camera where it stood. They follow from two kinds of evidence. Matched points of two
-views lie on each other's epipolar lines. And where an epipolar plane touches the object, both outlines touch it: the
-tangents from the epipoles to the convex hulls of two silhouettes correspond (Wong and Cipolla 2001), whether the object
-has texture or not.
+and for each further place of the camera where it stood. They follow from two kinds of observations. Matched points of
+two views lie on each other's epipolar lines. And where an epipolar plane touches the object, both outlines touch it:
+the tangents from the epipoles to the convex hulls of two silhouettes correspond (Wong and Cipolla 2001), whether the
+object has texture or not.
 
 The world has the axis as +z; the first camera is 1 away from the axis, at height 0.
 
@@ -24,7 +24,7 @@ from jaxtyping import Bool, Float64, Int, UInt8
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.marker_detection import require_opencv
 from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera, PoseSet
-from unmix_plugin.captures.poses.turntable_evidence import Evidence, Turn, gather
+from unmix_plugin.captures.poses.turntable_observations import Observations, Turn, gather
 from unmix_plugin.errors import CaptureError
 
 _LEAST_VIEWS = 3
@@ -80,19 +80,19 @@ def poses_from_turntable(
             f"{counts.min()} views were taken from place {counts.argmin() + 1} of the camera; expected {_LEAST_VIEWS} "
             "or more of each"
         )
-    evidence = gather(
+    observed = gather(
         cv2,
         [pictures[name] for name in names],
         [turns[name] for name in names],
         None if masks is None else [masks[name] for name in names],
     )
-    _refuse_alike(evidence, len(evidence.first))
-    fitted = _fit(evidence)
-    _refuse_unexplained(fitted, evidence)
-    return _pose_set(fitted, evidence, names)
+    _refuse_alike(observed, len(observed.first))
+    fitted = _fit(observed)
+    _refuse_unexplained(fitted, observed)
+    return _pose_set(fitted, observed, names)
 
 
-# Cameras from few numbers, and what of the evidence they leave unexplained.
+# Cameras from few numbers, and what of the observations they leave unexplained.
 
 
 _Poses: TypeAlias = tuple[Float64[np.ndarray, "n 3 3"], Float64[np.ndarray, "n 3"]]
@@ -112,14 +112,14 @@ class _Numbers:
     """To add to the angles."""
     k1: float = 0.0
 
-    def poses(self, evidence: Evidence) -> _Poses:
+    def poses(self, observed: Observations) -> _Poses:
         """Axes of all cameras in the world, as columns, and where they stand."""
         from scipy.spatial.transform import Rotation
 
-        yaw, pitch, roll, distance, azimuth, height = self.cameras[evidence.camera].T
+        yaw, pitch, roll, distance, azimuth, height = self.cameras[observed.camera].T
         inward = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # azimuth 0, to the axis
         turned = Rotation.from_euler("yxz", np.column_stack([yaw, -pitch, roll])).as_matrix()
-        about = azimuth - self.sense * (evidence.angle + self.slack)
+        about = azimuth - self.sense * (observed.angle + self.slack)
         swing = Rotation.from_euler("z", about[:, None]).as_matrix()
         reach = np.exp(distance)
         places = np.column_stack([reach * np.cos(about), reach * np.sin(about), height])
@@ -136,20 +136,20 @@ class _Numbers:
         return np.concatenate([ideal, np.ones((*ideal.shape[:-1], 1))], axis=-1)
 
     def errors(
-        self, evidence: Evidence, ahead: float = 0.0, rims: bool = True
+        self, observed: Observations, ahead: float = 0.0, rims: bool = True
     ) -> tuple[Float64[np.ndarray, " F"], Float64[np.ndarray, "Q 4"]]:
         """Distances of matched points from epipolar lines, and of outlines from tangents, pixels; with the first view
         of each pair turned `ahead` by so much. `rims`: less what comes of masks that are too wide or too narrow."""
-        second = self.poses(evidence)
-        first = replace(self, slack=self.slack + ahead).poses(evidence) if ahead else second
+        second = self.poses(observed)
+        first = replace(self, slack=self.slack + ahead).poses(observed) if ahead else second
         return (
-            self.focal_px * _epipolar(self.ideal(evidence.points, evidence.size), evidence, first, second),
-            _tangential(self, evidence, first, second, rims),
+            self.focal_px * _epipolar(self.ideal(observed.points, observed.size), observed, first, second),
+            _tangential(self, observed, first, second, rims),
         )
 
-    def cost(self, evidence: Evidence) -> float:
+    def cost(self, observed: Observations) -> float:
         """Mean of the robust errors."""
-        errors = np.concatenate([part.ravel() for part in self.errors(evidence)])
+        errors = np.concatenate([part.ravel() for part in self.errors(observed)])
         return float(np.mean(np.log1p((errors / _SCALE_PX) ** 2)))
 
 
@@ -163,10 +163,10 @@ def _essential(first: _Poses, second: _Poses) -> Float64[np.ndarray, "P 3 3"]:
 
 
 def _epipolar(
-    ideal: Float64[np.ndarray, "F 2 3"], evidence: Evidence, first: _Poses, second: _Poses
+    ideal: Float64[np.ndarray, "F 2 3"], observed: Observations, first: _Poses, second: _Poses
 ) -> Float64[np.ndarray, " F"]:
     """Distances of matched points from each other's epipolar lines, over the focal length (Sampson 1982)."""
-    i, j = evidence.first, evidence.second
+    i, j = observed.first, observed.second
     essential = _essential((first[0][i], first[1][i]), (second[0][j], second[1][j]))
     there = (essential @ ideal[:, 0, :, None])[..., 0]
     back = (essential.transpose(0, 2, 1) @ ideal[:, 1, :, None])[..., 0]
@@ -175,16 +175,16 @@ def _epipolar(
 
 
 def _tangential(
-    numbers: _Numbers, evidence: Evidence, first: _Poses, second: _Poses, rims: bool
+    numbers: _Numbers, observed: Observations, first: _Poses, second: _Poses, rims: bool
 ) -> Float64[np.ndarray, "Q 4"]:
     """How far outlines reach beyond the tangents of the others, pixels; what can't be compared counts as off."""
-    if not len(evidence.touched):
+    if not len(observed.touched):
         return np.zeros((0, 4))
-    i, j = evidence.touched.T
+    i, j = observed.touched.T
     essential = _essential((first[0][i], first[1][i]), (second[0][j], second[1][j]))
-    ideal = numbers.ideal(evidence.hulls, evidence.size)
+    ideal = numbers.ideal(observed.hulls, observed.size)
     middles = ((ideal.min(axis=1) + ideal.max(axis=1)) / 2)[:, None]
-    inside = np.all((evidence.hulls > 1.0) & (evidence.hulls < np.array(evidence.size) - 1.0), axis=-1)
+    inside = np.all((observed.hulls > 1.0) & (observed.hulls < np.array(observed.size) - 1.0), axis=-1)
     ends_i, out_i = _touching(ideal, middles, i, first[0][i], second[1][j] - first[1][i])
     ends_j, out_j = _touching(ideal, middles, j, second[0][j], first[1][i] - second[1][j])
     touch_i, touch_j = ideal[i[:, None], ends_i], ideal[j[:, None], ends_j]
@@ -207,7 +207,7 @@ def _tangential(
     good = good_i & np.where(straight, good_j, good_j[:, ::-1])
     of_i, of_j = numbers.focal_px * of_i, numbers.focal_px * of_j
     if rims:
-        of_i, of_j = _without_rims(of_i, of_j, good, evidence)
+        of_i, of_j = _without_rims(of_i, of_j, good, observed)
     found = np.where(np.tile(good, 2), np.concatenate([of_i, of_j], axis=1), _NOT_COMPARED_PX)
     return np.asarray(found)
 
@@ -236,14 +236,14 @@ def _without_rims(
     of_i: Float64[np.ndarray, "Q 2"],
     of_j: Float64[np.ndarray, "Q 2"],
     good: Bool[np.ndarray, "Q 2"],
-    evidence: Evidence,
+    observed: Observations,
 ) -> tuple[Float64[np.ndarray, "Q 2"], Float64[np.ndarray, "Q 2"]]:
     """Distances less what comes of masks that are too wide or too narrow, each by a length of its own."""
-    i, j = evidence.touched.T
+    i, j = observed.touched.T
     beyond = 0.5 * (of_i - of_j)
     weights = good / (1.0 + (beyond / _SCALE_PX) ** 2)
     weight, total = weights.sum(axis=1), (weights * beyond).sum(axis=1)
-    table, wanted = _RIM_PRIOR * np.eye(len(evidence.angle)), np.zeros(len(evidence.angle))
+    table, wanted = _RIM_PRIOR * np.eye(len(observed.angle)), np.zeros(len(observed.angle))
     for rows, columns, sign in ((i, i, 1), (j, j, 1), (i, j, -1), (j, i, -1)):
         np.add.at(table, (rows, columns), sign * weight)
     np.add.at(wanted, i, total)
@@ -258,7 +258,7 @@ def _without_rims(
 
 def _solve(
     start: _Numbers,
-    evidence: Evidence,
+    observed: Observations,
     which: Sequence[int],
     steps: int,
     zoom: bool = True,
@@ -285,7 +285,7 @@ def _solve(
         return replace(start, focal_px=focal, cameras=cameras, slack=angles, k1=k1)
 
     def flat(numbers: _Numbers, **changes: Any) -> np.ndarray:
-        return np.concatenate([part.ravel() for part in numbers.errors(evidence, **changes)])
+        return np.concatenate([part.ravel() for part in numbers.errors(observed, **changes)])
 
     def errors(values: np.ndarray) -> np.ndarray:
         return np.append(flat(numbers_of(values)), values[few:] / np.radians(_SLACK_DEG))
@@ -300,8 +300,8 @@ def _solve(
         if slack:
             numbers = numbers_of(values)  # rims, which all pairs share, are taken to stay
             by_turn = (flat(numbers, ahead=1e-5, rims=False) - flat(numbers, rims=False)) / 1e-5
-            rows, four = np.arange(len(now)), np.repeat(evidence.touched, 4, axis=0)
-            ends = np.concatenate([np.column_stack([evidence.first, evidence.second]), four])
+            rows, four = np.arange(len(now)), np.repeat(observed.touched, 4, axis=0)
+            ends = np.concatenate([np.column_stack([observed.first, observed.second]), four])
             result[rows, few + ends[:, 0]] = by_turn
             result[rows, few + ends[:, 1]] = -by_turn
             result[len(now) + np.arange(views), few + np.arange(views)] = 1.0 / np.radians(_SLACK_DEG)
@@ -320,10 +320,10 @@ def _solve(
     return numbers_of(found.x)
 
 
-def _fit(evidence: Evidence) -> _Numbers:
-    """The numbers that explain the evidence best, from beginnings of many focal lengths and both senses."""
-    rough, fine = evidence.thinned(_MOST_ROUGH), evidence.thinned(_MOST_FINE)
-    longer, everyone = max(evidence.size), range(int(evidence.camera.max()) + 1)
+def _fit(observed: Observations) -> _Numbers:
+    """The numbers that explain the observations best, from beginnings of many focal lengths and both senses."""
+    rough, fine = observed.thinned(_MOST_ROUGH), observed.thinned(_MOST_FINE)
+    longer, everyone = max(observed.size), range(int(observed.camera.max()) + 1)
     ends = []
     for sense in (1.0, -1.0):
         begun = [_begin(rough, factor * longer, sense) for factor in _FOCAL_FACTORS]
@@ -337,25 +337,25 @@ def _fit(evidence: Evidence) -> _Numbers:
     best = ends[int(np.argmin(looks_down if is_unclear else costs))]
     best = _solve(best, fine, everyone, steps=40)
     fits = np.abs(best.errors(fine)[0]) < _FITS_PX
-    if len(fits) and fits.mean() < _ENOUGH_FIT and len(fine.touched) and evidence.likeness <= _MOST_ALIKE:
-        none = evidence.first[:0]
+    if len(fits) and fits.mean() < _ENOUGH_FIT and len(fine.touched) and observed.likeness <= _MOST_ALIKE:
+        none = observed.first[:0]
         # On plain things most matches are chance, such as highlights, and would pull the cameras with them.
-        return _fit(replace(evidence, first=none, second=none, points=evidence.points[:0]))
+        return _fit(replace(observed, first=none, second=none, points=observed.points[:0]))
     distorted = _solve(best, fine, everyone, steps=20, distorted=True)
     # By how much of half the diagonal distortion moves the corners of a picture.
-    moved = abs(distorted.k1) * (np.hypot(*evidence.size) / 2 / distorted.focal_px) ** 2
+    moved = abs(distorted.k1) * (np.hypot(*observed.size) / 2 / distorted.focal_px) ** 2
     if distorted.cost(fine) < (1.0 - _GAIN) * best.cost(fine) and moved < _MOST_DISTORTION:
         best = distorted
     loose = _solve(best, fine, everyone, steps=20, distorted=bool(best.k1), slack=True)
     return loose if loose.cost(fine) < (1.0 - _SLACK_GAIN) * best.cost(fine) else best
 
 
-def _begin(evidence: Evidence, focal_px: float, sense: float) -> _Numbers:
+def _begin(observed: Observations, focal_px: float, sense: float) -> _Numbers:
     """All places of the camera at one distance from a point of the axis, each turned as its own views have it."""
-    count = int(evidence.camera.max()) + 1
-    start = _Numbers(focal_px, sense, np.zeros((count, 6)), np.zeros(len(evidence.angle)))
+    count = int(observed.camera.max()) + 1
+    start = _Numbers(focal_px, sense, np.zeros((count, 6)), np.zeros(len(observed.angle)))
 
-    def best_of(camera: int, column: int, degrees: Sequence[float], those: Evidence) -> None:
+    def best_of(camera: int, column: int, degrees: Sequence[float], those: Observations) -> None:
         def cost(value: float) -> float:
             start.cameras[camera, column] = value
             return start.cost(those)
@@ -363,7 +363,7 @@ def _begin(evidence: Evidence, focal_px: float, sense: float) -> _Numbers:
         start.cameras[camera, column] = min(np.radians(degrees).tolist(), key=cost)
 
     for camera in range(count):
-        at_place = evidence.part(evidence.camera == camera)
+        at_place = observed.part(observed.camera == camera)
         best_of(camera, _PITCH, _PITCHES_DEG, at_place)
         start.cameras[camera, :3] = _solve(start, at_place, [camera], steps=8, zoom=False).cameras[camera, :3]
     pitch = start.cameras[:, _PITCH]
@@ -371,7 +371,7 @@ def _begin(evidence: Evidence, focal_px: float, sense: float) -> _Numbers:
     start.cameras[:, 3] = np.log(distance * np.cos(pitch))
     start.cameras[:, 5] = distance * (np.sin(pitch) - np.sin(pitch[0]))
     for camera in range(1, count):
-        pair = evidence.part((evidence.camera == camera) | (evidence.camera == 0))
+        pair = observed.part((observed.camera == camera) | (observed.camera == 0))
         best_of(camera, _AZIMUTH, np.arange(0.0, 360.0, 10.0).tolist(), pair)
     return start
 
@@ -379,25 +379,25 @@ def _begin(evidence: Evidence, focal_px: float, sense: float) -> _Numbers:
 # What is refused, and the result.
 
 
-def _refuse_alike(evidence: Evidence, fits: int) -> None:
+def _refuse_alike(observed: Observations, fits: int) -> None:
     """Refuse views whose silhouettes tell nothing, where too few matches fit to tell it instead."""
-    if evidence.likeness <= _MOST_ALIKE or fits >= max(_LEAST_MATCHES, _LEAST_FIT * len(evidence.first)):
+    if observed.likeness <= _MOST_ALIKE or fits >= max(_LEAST_MATCHES, _LEAST_FIT * len(observed.first)):
         return
-    has_masks = len(evidence.touched) > 0
-    silhouettes = f"silhouettes overlap by {evidence.likeness:.1%}" if has_masks else "there are no masks"
+    has_masks = len(observed.touched) > 0
+    silhouettes = f"silhouettes overlap by {observed.likeness:.1%}" if has_masks else "there are no masks"
     raise CaptureError(
-        f"the axis can't be told, as all views are alike: {silhouettes}, and {fits} of {len(evidence.first)} points "
+        f"the axis can't be told, as all views are alike: {silhouettes}, and {fits} of {len(observed.first)} points "
         "that were matched and moved fit one; put something patterned on the turntable, or cut out the background"
     )
 
 
-def _refuse_unexplained(fitted: _Numbers, evidence: Evidence) -> None:
-    matched, outlines = fitted.errors(evidence)
+def _refuse_unexplained(fitted: _Numbers, observed: Observations) -> None:
+    matched, outlines = fitted.errors(observed)
     fits = int((np.abs(matched) < _FITS_PX).sum())
-    _refuse_alike(evidence, fits)
+    _refuse_alike(observed, fits)
     compared = np.abs(outlines[outlines != _NOT_COMPARED_PX])
     off = float(np.percentile(compared, 75)) if len(compared) else np.inf
-    limit = _MOST_OFF * float(np.hypot(*evidence.size))
+    limit = _MOST_OFF * float(np.hypot(*observed.size))
     if off <= limit or fits >= max(_ENOUGH_MATCHES, _ENOUGH_FIT * len(matched)):
         return
     outlines_off = (
@@ -410,16 +410,16 @@ def _refuse_unexplained(fitted: _Numbers, evidence: Evidence) -> None:
     )
 
 
-def _pose_set(fitted: _Numbers, evidence: Evidence, names: Sequence[str]) -> PoseSet:
-    axes, places = fitted.poses(evidence)
-    width, height = evidence.size
+def _pose_set(fitted: _Numbers, observed: Observations, names: Sequence[str]) -> PoseSet:
+    axes, places = fitted.poses(observed)
+    width, height = observed.size
     focal = (fitted.focal_px, fitted.focal_px)
     lens = Lens(width, height, focal, (width / 2, height / 2), (fitted.k1, 0.0, 0.0, 0.0))
     cameras = {
         name: PosedCamera(np.column_stack([axes[index] @ FLIP, places[index]]), lens)
         for index, name in enumerate(names)
     }
-    matched, outlines = (np.abs(part) for part in fitted.errors(evidence))
+    matched, outlines = (np.abs(part) for part in fitted.errors(observed))
     compared = outlines[outlines != _NOT_COMPARED_PX]
     off = f", outlines are off by {np.median(compared):.2f} px in the median" if len(compared) else ""
     fits = f"{int((matched < _FITS_PX).sum())} of {len(matched)} matched points fit"

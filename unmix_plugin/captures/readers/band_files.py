@@ -66,9 +66,9 @@ def open_band_folder(folder: Path, open_band: Callable[[Path], Cube]) -> Cube:
     order = np.arange(len(bands)) if centres is None else np.argsort(centres, kind="stable")
     stack, others = stack_bands([bands[index] for index in order], folder), kinds.total() - number
     if named is not None:
-        evidence = f"names of files, such as {bands[0].path.name!r}: {named[1]}"
+        source = f"names of files, such as {bands[0].path.name!r}: {named[1]}"
         widths = stack.bands.fwhm_nm if named[2] is None else named[2][order]
-        table = replace(stack.bands, wavelengths_nm=named[0][order], evidence=evidence, fwhm_nm=widths)
+        table = replace(stack.bands, wavelengths_nm=named[0][order], source=source, fwhm_nm=widths)
         stack = replace(stack, bands=table)
     if others:
         pictures = "picture of another kind" if others == 1 else "pictures of other kinds"
@@ -143,7 +143,7 @@ def _table_of(tables: Sequence[BandTable]) -> BandTable:
     names = _joined([table.names for table in tables])
     return BandTable(
         centres,
-        "only some of the files give wavelengths" if is_partial else tables[0].evidence,
+        "only some of the files give wavelengths" if is_partial else tables[0].source,
         _joined([table.fwhm_nm for table in tables]),
         np.concatenate(marks) if is_marked else None,
         None if names is None else tuple(names.tolist()),

@@ -224,8 +224,8 @@ def _choose(
         bands = _in_order(bands)
         found, table = wavelengths_in_names(bands), BandTable(names=tuple(bands))
         if found is not None:
-            evidence = f"names of channels, such as {bands[0]!r}: {found[1]}"
-            table = replace(table, wavelengths_nm=found[0], evidence=evidence, fwhm_nm=found[2])
+            source = f"names of channels, such as {bands[0]!r}: {found[1]}"
+            table = replace(table, wavelengths_nm=found[0], source=source, fwhm_nm=found[2])
         return table, [by_name[name] for name in bands]
     if wanted is None and len(layers) > 1 and layers[0] not in LAYERS:
         raise CaptureError(

@@ -118,7 +118,7 @@ def open_spectral_file(path: Path, options: ReadOptions | None = None) -> Cube:
             raise CaptureError(
                 f"{opened.path}: {len(given)} wavelengths were given for {size}{said_of_mosaic(opened)}"
             )
-        bands = replace(opened.bands, wavelengths_nm=given, evidence="given by the user", is_given=True)
+        bands = replace(opened.bands, wavelengths_nm=given, source="given by the user", is_given=True)
         return replace(opened, bands=bands)
     except CaptureError:
         raise
@@ -225,7 +225,7 @@ def inspect_file(path: Path, options: ReadOptions | None = None) -> dict[str, An
             "dtype": opened.dtype.newbyteorder("=").name,
             "interleave": opened.interleave,
             "wavelengths_nm": _listed(bands.wavelengths_nm),
-            "wavelength_evidence": bands.evidence,
+            "wavelength_evidence": bands.source,
             "fwhm_nm": _listed(bands.fwhm_nm),
             "band_names": bands.names and list(bands.names),
             "bad_bands": None if bands.bad is None else np.flatnonzero(bands.bad).tolist(),

@@ -271,8 +271,8 @@ def _what_was_done(plan: Plan, posed: PosedViews, views: Sequence[ViewRecord]) -
         )
         for key, what in (("dark", "dark frame"), ("white", "white reference")):
             lines += [f"{where}{what}: {used[key]['use']}"] if key in used else []
-        stored, evidence = sensor.saturation.stored, sensor.saturation.evidence
-        lines.append(f"{where}saturation: {evidence if stored is None else f'from {stored:g} ({evidence})'}")
+        stored, reason = sensor.saturation.stored, sensor.saturation.reason
+        lines.append(f"{where}saturation: {reason if stored is None else f'from {stored:g} ({reason})'}")
         dropped: dict[str, list[str]] = defaultdict(list)
         for index, band in sorted(sensor.bands.dropped.items()):
             reason = "noisy" if band.fault is BandFault.NOISY else band.reason
@@ -282,7 +282,7 @@ def _what_was_done(plan: Plan, posed: PosedViews, views: Sequence[ViewRecord]) -
             for reason, names in dropped.items()
         ]
     lines.append(
-        f"{plan.scale.value:g} is written as 1: {plan.scale.evidence}; full scale of the cubes is {FULL_SCALE}"
+        f"{plan.scale.value:g} is written as 1: {plan.scale.reason}; full scale of the cubes is {FULL_SCALE}"
     )
 
     def total(what: str) -> str:

@@ -111,7 +111,7 @@ def _read_angles(path: Path, names: Sequence[str]) -> dict[str, Turn]:
 
 
 @dataclass(frozen=True)
-class Evidence:
+class Observations:
     """What pictures tell of the cameras."""
 
     angle: Float64[np.ndarray, " N"]
@@ -132,12 +132,12 @@ class Evidence:
     likeness: float
     """Mean overlap of silhouettes with what most views of their place show, intersection over union."""
 
-    def part(self, views: Bool[np.ndarray, " N"]) -> Evidence:
+    def part(self, views: Bool[np.ndarray, " N"]) -> Observations:
         """That between some views alone; the numbers of views stay."""
         keep = views[self.first] & views[self.second]
         return self._kept(keep, np.asarray(views[self.touched].all(axis=1)))
 
-    def thinned(self, most: tuple[int, int]) -> Evidence:
+    def thinned(self, most: tuple[int, int]) -> Observations:
         """At most so many matches and pairs of outlines, drawn at random."""
         generator = np.random.default_rng(0)
         keep, pairs = (
@@ -146,7 +146,7 @@ class Evidence:
         )
         return self._kept(keep, pairs)
 
-    def _kept(self, matches: np.ndarray, pairs: np.ndarray) -> Evidence:
+    def _kept(self, matches: np.ndarray, pairs: np.ndarray) -> Observations:
         found = {name: getattr(self, name)[matches] for name in ("first", "second", "points")}
         return replace(self, **found, touched=self.touched[pairs])
 
@@ -156,7 +156,7 @@ def gather(
     pictures: Sequence[UInt8[np.ndarray, "H W"]],
     turns: Sequence[Turn],
     masks: Sequence[Bool[np.ndarray, "H W"]] | None,
-) -> Evidence:
+) -> Observations:
     """What views of one size tell, with masks that are True on the object."""
     height, width = pictures[0].shape
     angle = np.radians([turn.angle_deg for turn in turns])
@@ -176,7 +176,7 @@ def gather(
             points.append(_matches(matcher, features[i], features[j]))
             first += [i] * len(points[-1])
             second += [j] * len(points[-1])
-    return Evidence(
+    return Observations(
         angle,
         camera,
         (width, height),
