@@ -11,12 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from unmix_plugin.captures.calibration.references import GivenReferences, require_comparable
-from unmix_plugin.captures.cube import (
-    Capture,
-    CaptureView,
-    Cube,
-    ReadOptions,
-)
+from unmix_plugin.captures.cube import Capture, CaptureView, Cube, ReadOptions
 from unmix_plugin.captures.decisions import decisions_of
 from unmix_plugin.captures.finding_poses import marked_poses, poses_of_written_views
 from unmix_plugin.captures.layouts.masks import with_mask_files
@@ -35,12 +30,7 @@ from unmix_plugin.captures.options import (
 from unmix_plugin.captures.plan import Plan, make_plan
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.pose_set import PosedCamera
-from unmix_plugin.captures.posing import (
-    PosedViews,
-    asked_distance,
-    given_poses,
-    pose_views,
-)
+from unmix_plugin.captures.posing import PosedViews, asked_distance, given_poses, pose_views
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.report import Code, Kind, Remark, sentences
 from unmix_plugin.captures.spoilt import UnreadableViews, judge_sharpness
@@ -56,9 +46,7 @@ from unmix_plugin.captures.writing.work_folder import (
     refuse_output,
 )
 from unmix_plugin.engine.decisions import decision_table
-from unmix_plugin.engine.runs.replacing import (
-    require_apart,
-)
+from unmix_plugin.engine.runs.replacing import require_apart
 from unmix_plugin.errors import CaptureError, ConfigError, did_you_mean, name_some
 
 _Say = Callable[[str], None]
@@ -70,7 +58,7 @@ _Follow = Callable[[str, Sequence[CaptureView]], Iterable[CaptureView]]
 def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list[str]:
     """Make the scene that the options ask for.
 
-    A start that was interrupted is gone on with where inputs and options are the same.
+    A start that was interrupted is resumed where inputs and options are the same.
 
     Returns:
         What is to be told at the end: what looks wrong, one sentence each.
@@ -89,13 +77,13 @@ def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list
     capture = _open_capture(options, references)
     say(f"{capture.root}: {len(capture.views)} views of the layout {capture.layout}")
     check_pose_options(options, capture.names)
-    known = asked_distance(options, capture.views)
+    distance = asked_distance(options, capture.views)
     wanted, left_out = _wanted_views(capture, options)
 
     # Decide: from samples of the views, beside their cameras where these are known already.
     posed = None
     if options.poses not in FROM_PICTURES:
-        posed = pose_views(wanted, given_poses(capture, options.poses), known)
+        posed = pose_views(wanted, given_poses(capture, options.poses), distance)
     cameras = None if posed is None else posed.poses.cameras
     chosen = wanted if posed is None else posed.views
     plan = make_plan(capture, chosen, options, given=references, cameras=cameras)
@@ -104,7 +92,7 @@ def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list
     left_out |= plan.left_out
     if options.poses == MARKERS:
         say("looking for markers ...")
-        posed = pose_views(_without(plan.views, left_out), marked_poses(plan, options), known)
+        posed = pose_views(_without(plan.views, left_out), marked_poses(plan, options), distance)
     require_apart(
         (folder.output, folder.path),
         [("the capture's", path) for view in capture.views for path in input_files(view)],
@@ -115,7 +103,7 @@ def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list
     if folder.begin(
         {**fingerprint(plan, options), "lenses": sorted(numbers for _, numbers in resampled.values())}
     ):
-        say(f"going on with {folder.path}")
+        say(f"resuming {folder.path}")
     lenses = {name: lens for name, (lens, _) in resampled.items()}
     views = follow("writing views", plan.views if posed is None else posed.views)
     records, unreadable = _write_views(views, plan, lenses, folder)
@@ -132,7 +120,7 @@ def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list
     if posed is None:
         say("estimating poses ...")
         found = poses_of_written_views(plan, sound, folder.path, folder.poses, options)
-        posed = pose_views(_without(plan.views, left_out), found, known)
+        posed = pose_views(_without(plan.views, left_out), found, distance)
         _refuse_late(_resampled_lenses(plan, posed))
     for note in sentences(posed.remarks, Kind.DONE):
         say(f"poses: {note}")
@@ -163,8 +151,8 @@ def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list
 def _write_views(
     views: Iterable[CaptureView], plan: Plan, lenses: Mapping[str, Lens], folder: WorkFolder
 ) -> tuple[dict[str, ViewRecord], dict[str, Remark]]:
-    """Write the files of all views that are not there yet, brought into other lenses where there are such; and say
-    which can't be read, by name. Raises CaptureError: too many can't be."""
+    """Write the files of all views that are not there yet, brought into other lenses where there are such; gives their
+    records and why others can't be read, by name. Raises CaptureError: too many can't be."""
     records: dict[str, ViewRecord] = {}
     unreadable = UnreadableViews(len(plan.views))
     for view in views:
@@ -211,9 +199,9 @@ def _blurred(
     plan: Plan,
     records: Mapping[str, ViewRecord],
     cameras: Mapping[str, PosedCamera] | None,
-    known: Collection[str],
+    judged: Collection[str],
 ) -> dict[str, Remark]:
-    """Views that are blurred, among those of which nothing else is `known`."""
+    """Views that are blurred, without those that are judged already."""
     found: dict[str, Remark] = {}
     for sensor in plan.sensors:
         sharpness = {
@@ -222,7 +210,7 @@ def _blurred(
             if record.sensor == sensor and name not in plan.left_out
         }
         found |= judge_sharpness(sharpness, cameras)
-    return {name: remark for name, remark in found.items() if name not in known}
+    return {name: remark for name, remark in found.items() if name not in judged}
 
 
 def _resampled_lenses(plan: Plan, posed: PosedViews) -> dict[str, tuple[Lens, list[float]]]:

@@ -262,7 +262,7 @@ def contrast_picture(
 
 def _reconstruct(path: Path) -> None:
     """Write `found.json`: folder, registered images and reprojection error of each model, and `_matches_of_views`.
-    Files of an earlier try of the same pictures are gone on with.
+    Files of an earlier try of the same pictures are used again.
 
     The settings: `folder`, with `images` and, where `has_masks`, `masks` (IMAGE.png, black where no features are
     wanted); `sensors`, names of image files with one lens each; `sequential`, whether to match neighbours in the order

@@ -1,5 +1,5 @@
 """The unfinished folder beside the output, in which a scene gathers until it is complete; and the files that the scene
-is made of, by which an interrupted start tells whether it can be gone on with."""
+is made of, by which an interrupted start tells whether it can be resumed."""
 
 from __future__ import annotations
 
@@ -60,12 +60,12 @@ class WorkFolder:
             refuse_folder(self.path, _SCRATCH)
 
     def begin(self, plan: dict[str, Any]) -> bool:
-        """Make the folder, or go on in the one that an interrupted start left.
+        """Make the folder, or resume the one that an interrupted start left.
 
         Views that were made with another plan (options, decisions and inputs) are thrown away.
 
         Returns:
-            Whether an earlier start is gone on with.
+            Whether an earlier start is resumed.
         Raises:
             ConfigError: there is a folder of this name that is not ours, or has something in it that is not.
             RunError: it can't be written.
@@ -158,7 +158,7 @@ def _json(value: Any) -> bytes:
 
 
 def fingerprint(plan: Plan, options: ProcessOptions) -> dict[str, Any]:
-    """What must be the same for views to be gone on with: options, decisions and input files. Raises CaptureError: a
+    """What must be the same for views to be used again: options, decisions and input files. Raises CaptureError: a
     file can't be read."""
     free = [
         "output_dir",
