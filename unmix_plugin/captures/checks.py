@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
-from unmix_plugin.captures.poses.pose_set import PosedCamera
+from unmix_plugin.captures.poses.pose_set import PosedCamera, angles_between_axes
 from unmix_plugin.captures.report import Code, Remark
 from unmix_plugin.captures.writing.view_files import ViewRecord
 from unmix_plugin.engine.geometry.camera_paths import meeting_point
@@ -154,8 +154,7 @@ def _cameras(views: Sequence[SeenView], scales: Sequence[float]) -> Cameras:
 
 def angles_between(views: Sequence[SeenView]) -> Float64[np.ndarray, "N N"]:
     """Angles between optical axes, degrees."""
-    axes = np.stack([view.axis for view in views])
-    return np.degrees(np.arccos(np.clip(axes @ axes.T, -1.0, 1.0)))
+    return np.degrees(angles_between_axes([view.camera for view in views]))
 
 
 def _pixels(views: Sequence[SeenView]) -> list[Remark]:

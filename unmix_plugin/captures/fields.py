@@ -248,13 +248,15 @@ def state_linear(
         if len(gains) == 1 and not offsets and named.get("gain") == keys[0]:
             continue
         used = tuple(key for key, column in zip(keys, (gains, offsets), strict=True) if column)
+        names = {named_by(key) for key in used}
+        meaning = next((means for name, means in _MEANINGS.items() if name in names), Meaning.FRACTION)
         linear = linear_values(
             path,
             num_bands,
             gains=gains,
             offsets=offsets,
             source=f"{where} {' and '.join(map(repr, used))}",
-            meaning=_meaning_by(used),
+            meaning=meaning,
             entries=used,
         )
         if linear is not None:
@@ -281,12 +283,6 @@ def state_linear(
         meaning=Meaning.REFLECTANCE,
         entries=(*(found[0].entries if found else ()), key),
     )
-
-
-def _meaning_by(entries: Sequence[str]) -> Meaning:
-    """What values are that entries of these names lead to."""
-    plain = {named_by(entry) for entry in entries}
-    return next((meaning for name, meaning in _MEANINGS.items() if name in plain), Meaning.FRACTION)
 
 
 def _floats(path: Path, what: str, value: Any) -> list[float]:

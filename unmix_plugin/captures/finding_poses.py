@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Float32
 
 from unmix_plugin.captures.calibration.calibration import Calibration
 from unmix_plugin.captures.cube import CaptureView
@@ -76,7 +76,7 @@ def poses_of_written_views(
     Raises:
         CaptureError: a library is not installed, or the pictures do not tell.
     """
-    shown = {name: _shown(scene, record) for name, record in records.items()}
+    shown = {name: np.logical_and(*record.read_masks(scene)) for name, record in records.items()}
     pictures = {
         name: contrast_picture(
             map_array(scene / record.paths["hyperspectral_file_path"]), float(FULL_SCALE), shown[name]
@@ -108,18 +108,6 @@ def _in_files(plan: Plan, poses: PoseSet) -> PoseSet:
             whole = raster.lens_of_file(camera.lens, view.cube.shape[0], view.cube.shape[1])
             cameras[view.name] = replace(camera, lens=whole)
     return replace(poses, cameras=cameras)
-
-
-def _shown(scene: Path, record: ViewRecord) -> Bool[np.ndarray, "H W"]:
-    """Pixels of the foreground that were measured."""
-    from PIL import Image
-
-    with Image.open(scene / record.paths["file_path"]) as picture:
-        shown = np.asarray(picture.convert("RGBA"))[..., 3] > 127
-    if "mask_path" in record.paths:
-        with Image.open(scene / record.paths["mask_path"]) as mask:
-            shown = shown & (np.asarray(mask.convert("L")) > 0)
-    return shown
 
 
 def _sightings(plan: Plan, options: ProcessOptions) -> tuple[Sightings, list[str]]:

@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Float64, Int
 
 from unmix_plugin.captures.poses.lens import Lens, Points
-from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera
+from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera, angles_between_axes
 from unmix_plugin.captures.report import Code, Remark
 from unmix_plugin.engine.sampling import evenly_spaced
 
@@ -149,8 +149,7 @@ class MatchedScene:
     def of(names: Sequence[str], views: Sequence[MatchedView]) -> MatchedScene:
         """Match the features of near views of one sensor."""
         cameras = [camera for camera, _ in views]
-        axes = np.stack([-camera.camera_to_world[:, 2] for camera in cameras])
-        angles_deg = np.degrees(np.arccos(np.clip(axes @ axes.T, -1.0, 1.0)))
+        angles_deg = np.degrees(angles_between_axes(cameras))
         chosen = []  # views spread over all, each with those that are turned least against it, but enough
         for view in evenly_spaced(len(views), _STARS):
             low, high = _ANGLES_DEG

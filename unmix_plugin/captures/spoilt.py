@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
-from unmix_plugin.captures.poses.pose_set import PosedCamera
+from unmix_plugin.captures.poses.pose_set import PosedCamera, angles_between_axes
 from unmix_plugin.captures.report import Code, Remark
 from unmix_plugin.engine.sampling import robust_deviation
 from unmix_plugin.errors import CaptureError
@@ -83,9 +83,9 @@ def distances_between(
     order in which they were taken."""
     if cameras is None or any(name not in cameras for name in names):
         return np.abs(np.subtract.outer(np.arange(len(names)), np.arange(len(names)))).astype(float)
-    poses = np.stack([cameras[name].camera_to_world for name in names])
-    turned = np.arccos(np.clip(poses[:, :, 2] @ poses[:, :, 2].T, -1.0, 1.0))
-    moved = np.linalg.norm(poses[:, None, :, 3] - poses[None, :, :, 3], axis=-1)
+    places = np.stack([cameras[name].camera_to_world[:, 3] for name in names])
+    turned = angles_between_axes([cameras[name] for name in names])
+    moved = np.linalg.norm(places[:, None] - places[None], axis=-1)
     return turned + moved / max(float(np.median(moved)), 1e-12)
 
 

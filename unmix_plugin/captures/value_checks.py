@@ -102,21 +102,15 @@ class ViewSample:
     @staticmethod
     def of(record: ViewRecord, scene: Path) -> ViewSample:
         """Pixels on a grid; saturated ones are left out."""
-        from PIL import Image
-
         cube = map_array(scene / record.paths["hyperspectral_file_path"])
         rows, columns = (np.unique(np.linspace(0, side - 1, _SIDE).astype(int)) for side in cube.shape[:2])
         grid = np.ix_(rows, columns)
         stored = np.stack([cube[row][columns] for row in rows])
-        with Image.open(scene / record.paths["file_path"]) as picture:
-            kept = np.asarray(picture.convert("RGBA"))[..., 3][grid] > 127
-        border = np.concatenate([kept[0], kept[-1], kept[:, 0], kept[:, -1]])
-        third = [slice(side // 3, side - side // 3) for side in kept.shape]
-        is_hollow = bool(border.mean() > _FILLED and kept[third[0], third[1]].mean() < 1.0 - _FILLED)
-        if "mask_path" in record.paths:
-            with Image.open(scene / record.paths["mask_path"]) as mask:
-                kept = kept & (np.asarray(mask.convert("L"))[grid] > 0)
-        kept = kept & np.all(stored < FULL_SCALE, axis=-1)
+        foreground, measured = (mask[grid] for mask in record.read_masks(scene))
+        border = np.concatenate([foreground[0], foreground[-1], foreground[:, 0], foreground[:, -1]])
+        third = [slice(side // 3, side - side // 3) for side in foreground.shape]
+        is_hollow = bool(border.mean() > _FILLED and foreground[third[0], third[1]].mean() < 1.0 - _FILLED)
+        kept = foreground & measured & np.all(stored < FULL_SCALE, axis=-1)
         return ViewSample(record, stored[kept].astype(np.float32) / FULL_SCALE, is_hollow)
 
 

@@ -106,6 +106,12 @@ class PoseSet:
         return replace(self, cameras=cameras, points=points)
 
 
+def angles_between_axes(cameras: Sequence[PosedCamera]) -> Float64[np.ndarray, "N N"]:
+    """By how much each camera looks another way than each other one, radians."""
+    axes = np.stack([camera.camera_to_world[:, 2] for camera in cameras])
+    return np.arccos(np.clip(axes @ axes.T, -1.0, 1.0))
+
+
 def where_rays_meet(
     seen: Sequence[tuple[PosedCamera, Float64[np.ndarray, "P 2"]]],
 ) -> tuple[Float64[np.ndarray, "P 3"], Float64[np.ndarray, "N P"]] | None:

@@ -120,7 +120,12 @@ def stack_bands(parts: Sequence[Cube], path: Path) -> Cube:
         no_data=tuple(dict.fromkeys(of_all)),
         valid_range=None if differ else first.valid_range,
         exposure=_exposure_of_bands(parts, remarks),
-        **{name: _shared(parts, name) for name in _SHARED},
+        **{
+            name: getattr(
+                first if all(getattr(part, name) == getattr(first, name) for part in parts) else _PLAIN, name
+            )
+            for name in _SHARED
+        },
         others=_other_entries(parts),
         remarks=tuple(remarks),
         sources=tuple(source for part in parts for source in part.files),
@@ -148,12 +153,6 @@ def _table_of(tables: Sequence[BandTable]) -> BandTable:
         np.concatenate(marks) if is_marked else None,
         None if names is None else tuple(names.tolist()),
     )
-
-
-def _shared(parts: Sequence[Cube], name: str) -> Any:
-    """The field of this name where all parts have the same, otherwise its default."""
-    first = getattr(parts[0], name)
-    return first if all(getattr(part, name) == first for part in parts) else getattr(_PLAIN, name)
 
 
 def _other_entries(parts: Sequence[Cube]) -> dict[str, Any]:

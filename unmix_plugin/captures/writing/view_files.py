@@ -112,6 +112,17 @@ class ViewRecord:
     sources: list[dict[str, Any]] = field(default_factory=list)
     """Files it was made of: path, bytes, SHA-256."""
 
+    def read_masks(self, scene: Path) -> tuple[Bool[np.ndarray, "H W"], Bool[np.ndarray, "H W"]]:
+        """Pixels of the foreground, and pixels with a measurement, by the pictures in the folder of the scene."""
+        from PIL import Image
+
+        with Image.open(scene / self.paths["file_path"]) as picture:
+            foreground = np.asarray(picture.convert("RGBA"))[..., 3] > HALF
+        if "mask_path" not in self.paths:
+            return foreground, np.ones_like(foreground)
+        with Image.open(scene / self.paths["mask_path"]) as mask:
+            return foreground, np.asarray(mask.convert("L")) > 0
+
 
 @dataclass(frozen=True)
 class ViewRecipe:
