@@ -138,7 +138,7 @@ def way_of_fitting(name: str, pixels: int, field: Path | None) -> list[str]:
     words = ["neumatex", "--pipeline.model.material", "spectral", "--max-num-iterations", "1000000"]
     words += ["--pipeline.datamanager.train-num-rays-per-batch", str(pixels)]
     if name == STARTED:
-        return [*words, "--pipeline.model.from-run", str(field)]
+        return [*words, "--from-run", str(field)]
     return [*words, "--pipeline.model.num-endmembers", str(NUM_MATERIALS)]
 
 

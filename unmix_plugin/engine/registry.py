@@ -46,6 +46,7 @@ class MethodSpecification:
         scene: SceneMaker | None = None,
         products: Callable[[], Sequence[Any]] | None = None,
         name: str | None = None,
+        complete: Callable[[TrainerConfig], TrainerConfig] | None = None,
     ) -> None:
         """
         Args:
@@ -57,12 +58,15 @@ class MethodSpecification:
             products: What `unmix-export` can make of this method's runs and of no other's, as
                 `products.product.RunProduct` with defaults; called when the command is. None: nothing of its own.
             name: On the command line, as `config.method_name`; needed where `config` is made later.
+            complete: Given the settings of a new training before anything is read, makes what else it needs, such as
+                its data from those of another run, and gives the settings with that; None: they are as they are.
         """
         if name is None:
             config = config() if callable(config) else config
             name = config.method_name
         self._config, self.name = config, name
         self.description, self.scene, self.products = description, scene, products
+        self.complete = complete
 
     @cached_property
     def config(self) -> TrainerConfig:

@@ -21,6 +21,13 @@ def _products() -> Sequence[Any]:
     return (MaterialProduct(),)
 
 
+def _complete(config: TrainerConfig) -> TrainerConfig:
+    """See `completed`; imported when a training starts."""
+    from unmix_plugin.neumatex.from_run.completing import completed
+
+    return completed(config)
+
+
 def _neumatex() -> TrainerConfig:
     """The settings; imported when the method is used."""
     from unmix_plugin.neumatex.fit.data_manager import ObjectDataManagerConfig
@@ -47,7 +54,8 @@ def _neumatex() -> TrainerConfig:
 neumatex = MethodSpecification(
     _neumatex,
     name="neumatex",
-    description="relightable materials on a known mesh, from posed pictures under a known environment",
+    description="relightable materials of an object, on a given mesh and in a given light or on those of a run",
     scene=_scene,
     products=_products,
+    complete=_complete,
 )

@@ -38,6 +38,8 @@ _SOLID_ACCUMULATION = 0.9
 """Rays of which at least this much ends on something give points."""
 _TOLERANCE_PX = 2.0
 """Difference of distances, in pixels as large as they are at the point, that still counts as the same surface."""
+_FEWEST_IMAGES = 3
+"""In which a point is hidden that counts as inside: one alone may have it behind something at its edge."""
 _SCALE_BOUNDS = (1 / 16, 4.0)
 _SIDE_PX = 24
 """Least side of an image that surfaces are looked for in."""
@@ -141,6 +143,25 @@ class SeenSurface:
             hidden[left[in_sight]] = False
             left = left[~in_sight]
         return hidden
+
+    def signed_distance(self, positions: Float[Tensor, "P 3"], reach_px: float) -> Float[Tensor, " P"]:
+        """How far points lie before what the cameras see, means over those that see them or see what hides them by less
+        than `reach_px` pixels of the scene's images, as parts of that, at most 1; -1 behind all that the
+        images show, 1 where too few have the points in them.
+
+        Source: Curless and Levoy 1996, A Volumetric Method for Building Complex Models from Range Images.
+        """
+        sums, counts = torch.zeros(len(positions)), torch.zeros(len(positions))
+        images = torch.zeros(len(positions))
+        for camera, distances in self._views:
+            inside, excess = _excess_px(camera, distances, positions)
+            parts = (excess / (self._factor * reach_px)).clamp(max=1)
+            rows = inside.nonzero()[:, 0][parts > -1]
+            sums[rows] += parts[parts > -1]
+            counts[rows] += 1
+            images += inside
+        is_hidden = images >= min(_FEWEST_IMAGES, len(self._views))
+        return torch.where(counts > 0, sums / counts.clamp(min=1), torch.where(is_hidden, -1.0, 1.0))
 
     def _votes(
         self, positions: Float[Tensor, "P 3"], tolerance: float = 0.0

@@ -18,6 +18,7 @@ from unmix_plugin.engine.machine import resolve_device, seed_everything
 from unmix_plugin.engine.model import TrainingCallbackLocation, run_callbacks
 from unmix_plugin.engine.pipeline import Pipeline
 from unmix_plugin.engine.processes import ALONE, Follower, Processes, joined, require_equal_settings
+from unmix_plugin.engine.registry import discover_methods
 from unmix_plugin.engine.runs.checkpoints import (
     Checkpoint,
     TrainingRecord,
@@ -201,6 +202,9 @@ def prepare_steps(config: TrainerConfig, processes: Processes = ALONE) -> tuple[
     """Read the scene and make the model; settings without `auto`, and what takes the steps. Raises SceneError,
     ConfigError: scene or settings are wrong."""
     device = resolve_device(config.device)
+    method = discover_methods()[0].get(config.method_name)
+    if config.load_run is None and method is not None and method.complete is not None:
+        config = method.complete(config)
     seed_everything(config.seed)
     pipeline: Pipeline = config.pipeline.setup(data=require_data(config), device=device, seed=config.seed)
     if config.load_run is None:

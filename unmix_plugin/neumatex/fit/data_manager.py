@@ -18,14 +18,17 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from unmix_plugin.engine import (
+    AtStartOnly,
     Cameras,
     CommonFlag,
     DataManager,
     DataManagerConfig,
+    Decision,
     RayBundle,
     SceneBox,
     Target,
     TrainingCallback,
+    short_flag,
     step_generator,
 )
 from unmix_plugin.errors import Check, SceneError, require
@@ -67,6 +70,13 @@ class ObjectDataManagerConfig(DataManagerConfig):
     """For pictures of many bands: spectrum of the light, a .csv (wavelength,power), an ENVI spectral library or a name
     (D65, A, ...); None takes 'illuminant_path' of transforms.json."""
 
+    mesh: Annotated[Path | None, CommonFlag, AtStartOnly, short_flag("mesh")] = None
+    """Mesh in place of that of the data, or of --from-run."""
+    environment: Annotated[Path | None, CommonFlag, AtStartOnly, short_flag("environment")] = None
+    """Environment map in place of that of the data, or of --from-run; it is neither turned nor scaled."""
+    mesh_triangles: Annotated[int, CommonFlag, AtStartOnly, short_flag("mesh-triangles")] = 20_000
+    """Of the mesh that is made of a --from-run, at most."""
+
     def __post_init__(self) -> None:
         """Refuse impossible settings."""
         super().__post_init__()
@@ -75,6 +85,7 @@ class ObjectDataManagerConfig(DataManagerConfig):
             self,
             [
                 Check("max_pixels", "of at least 1", self.max_pixels >= 1),
+                Check("mesh_triangles", "of 100 to 1000000", 100 <= self.mesh_triangles <= 1_000_000),
             ],
         )
 
@@ -99,7 +110,7 @@ class ObjectDataManager(DataManager):
             from unmix_plugin.neumatex.demo.objects import demo_object_path
 
             data = demo_object_path(str(data), lambda line: sys.stderr.write(f"{line}\n"))
-        self.object = load_object(data, config.lamp)
+        self.object = load_object(data, config.lamp, mesh=config.mesh, environment=config.environment)
         pictures, split = self.object.pictures, self.object.split
         self.train_cameras = pictures.cameras[list(split.train)]
         self.eval_cameras = pictures.cameras[list(split.evaluation)]
@@ -199,6 +210,10 @@ class ObjectDataManager(DataManager):
     def identity(self, summary: Mapping[str, Any]) -> dict[str, Any]:
         """Views and the content of all files."""
         return {key: summary.get(key) for key in ("frames", "train_indices", "eval_indices", "input_hashes")}
+
+    def decisions(self) -> list[Decision]:
+        """What was decided about mesh and light when the object was made of a run."""
+        return list(self.object.decisions)
 
     def warnings(self) -> list[str]:
         """What the reader noted of the mesh."""

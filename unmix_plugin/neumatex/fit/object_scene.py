@@ -11,6 +11,7 @@ Notation: `H x W` pixels, `B` bands, `M` true materials.
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
@@ -18,8 +19,10 @@ from typing import cast
 import numpy as np
 from jaxtyping import Float64
 
+from unmix_plugin.engine import Decision
 from unmix_plugin.errors import SceneError
 from unmix_plugin.formats.json_values import describe
+from unmix_plugin.limits import MOST_TEXT_BYTES, read_bounded
 from unmix_plugin.neumatex.fit import checks
 from unmix_plugin.neumatex.fit.pictures import PosedPictures, read_picture, read_posed_pictures
 from unmix_plugin.neumatex.fit.tone import TONE_MAPPINGS, ToneMapping
@@ -88,6 +91,8 @@ class ObjectScene:
     """SHA-256 of mesh, environment and pictures."""
     notes: tuple[str, ...]
     """What is unusual but usable."""
+    decisions: tuple[Decision, ...]
+    """What was decided when it was made of a run."""
 
     def truth(self, index: int) -> dict[str, np.ndarray]:
         """What is known of a view's materials, float32: `base_colour` (H W 3), linear; or of spectral pictures
@@ -119,30 +124,33 @@ class ObjectScene:
         return found
 
 
-def load_object(root: Path, lamp: str | None = None) -> ObjectScene:
+def load_object(
+    root: Path, lamp: str | None = None, mesh: Path | None = None, environment: Path | None = None
+) -> ObjectScene:
     """Read and check an object's folder.
 
     Args:
+        mesh, environment: Files in place of the folder's; the latter is neither turned nor scaled.
         lamp: For pictures of many bands: what lit them, as `read_lamp` takes it, instead of what the folder says.
     Raises:
         SceneError: the folder is not a sound object; the message says what is wrong with it.
     """
     root, notes = root.resolve(), list[str]()
-    folder = _read_folder(root, notes, needs_mesh=True)
-    frame, mesh, pictures = _placed(folder, notes)
+    folder = _read_folder(root, notes, needs_mesh=True, mesh=mesh, environment=environment)
+    frame, placed_mesh, pictures = _placed(folder, notes)
     bands = _bands_of(folder, pictures, None)
     if bands is None and lamp is not None:
         raise SceneError(
             f"{root}: a lamp is given, but its pictures have {_NUM_COLOURS} colours; leave it out"
         )
     power = folder.lamp(bands) if bands is None or lamp is None else read_lamp(lamp, bands)
-    environment = folder.environment(bands, power)
-    notes += checks.light_doubts(pictures, environment)
+    light = folder.environment(bands, power)
+    notes += checks.light_doubts(pictures, light)
     relit = root / "relit"
     places = sorted(path for path in relit.iterdir() if path.is_dir()) if relit.is_dir() else []
     held_out = [_read_held_out(place, frame, pictures, bands, power, notes) for place in places]
     if bands is not None and power is None:
-        mean = environment.mean_radiance().double().numpy()
+        mean = light.mean_radiance().double().numpy()
         if not (mean > 0).all():
             raise SceneError(
                 f"{folder.environment_path}: is black at {bands.centers_nm[int(np.argmin(mean))]:g} nm, where nothing "
@@ -153,8 +161,8 @@ def load_object(root: Path, lamp: str | None = None) -> ObjectScene:
     files = (folder.mesh_path, folder.environment_path)
     scene = ObjectScene(
         root=root,
-        mesh=mesh,
-        environment=environment,
+        mesh=placed_mesh,
+        environment=light,
         frame=frame,
         pictures=pictures,
         split=folder.split,
@@ -166,10 +174,28 @@ def load_object(root: Path, lamp: str | None = None) -> ObjectScene:
         abundance_files=abundance_files,
         input_hashes={**{path.name: sha256_of(path) for path in files}, **pictures.hashes},
         notes=tuple(notes),
+        decisions=read_decisions(root),
     )
     for view in scene.split.evaluation:  # a malformed truth is told before training, not after it
         scene.truth(view)
     return scene
+
+
+DECISIONS_FILE = "decisions.json"
+"""In a folder that was made of a run: what was decided about the object."""
+
+
+def read_decisions(root: Path) -> tuple[Decision, ...]:
+    """What was decided about an object when it was made of a run; nothing where it was not."""
+    path = root / DECISIONS_FILE
+    if not path.is_file():
+        return ()
+    try:
+        return tuple(Decision(**each) for each in json.loads(read_bounded(path, MOST_TEXT_BYTES)))
+    except (OSError, ValueError, TypeError) as error:
+        raise SceneError(
+            f"{path}: is damaged ({error}); make the object again, or remove the file"
+        ) from error
 
 
 @dataclass(frozen=True)
@@ -204,15 +230,28 @@ class _Folder:
         return read_lamp(str(path), bands)
 
 
-def _read_folder(root: Path, notes: list[str], needs_mesh: bool) -> _Folder:
-    """Read and check the keys of a folder's transforms.json; `notes` gets what is unusual."""
+def _read_folder(
+    root: Path,
+    notes: list[str],
+    needs_mesh: bool,
+    mesh: Path | None = None,
+    environment: Path | None = None,
+) -> _Folder:
+    """Read and check the keys of a folder's transforms.json; `notes` gets what is unusual. Files that are given take
+    the place of the folder's."""
     faults = Faults(root)
     entry = read_entries(root, faults, needs_cubes=False)
     keys = entry.keys
     split = split_frames(entry, "auto", _EVAL_INTERVAL, faults) if needs_mesh else Split((), ())
-    environment = _find_file(root, keys.environment_path, "environment", ENVIRONMENT_SUFFIXES, faults)
-    mesh = _find_file(root, keys.mesh_path, "mesh", MESH_SUFFIXES, faults) if needs_mesh else root
     turned = (keys.environment_rotation_deg or 0.0, keys.environment_exposure_stops or 0.0)
+    if environment is not None:
+        turned = (0.0, 0.0)
+    else:
+        environment = _find_file(root, keys.environment_path, "environment", ENVIRONMENT_SUFFIXES, faults)
+    if not needs_mesh:
+        mesh = root
+    elif mesh is None:
+        mesh = _find_file(root, keys.mesh_path, "mesh", MESH_SUFFIXES, faults)
     tone = keys.tone_mapping
     if tone is not None and tone not in TONE_MAPPINGS:
         known = ", ".join(TONE_MAPPINGS)

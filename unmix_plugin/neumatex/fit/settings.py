@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
 Auto = Literal["auto"]
 PriorName = Literal["small", "none"]
-MaterialName = Literal["neural", "pbr", "spectral"]
-"""Families that can be trained."""
+MaterialName = Literal["neural", "pbr", "spectral", "auto"]
+"""Families that can be trained; auto becomes one of the others when training starts."""
 _USUAL_ENDMEMBERS = 6
 
 
@@ -107,17 +107,18 @@ class NeumatexModelConfig(ModelConfig):
     _target: Target = "unmix_plugin.neumatex.fit.model:NeumatexModel"
     eval_num_rays_per_chunk: tyro.conf.Suppress[int | Auto] = "auto"
     """No flag: pictures are traced in parts of a size of their own."""
-    material: Annotated[MaterialName, CommonFlag] = "neural"
+    material: Annotated[MaterialName, CommonFlag] = "auto"
     """Family of materials: neural (base colour and latents of a shared decoder), pbr (base colour, roughness,
     metallicity), or for pictures of many bands spectral (a mixture of endmember reflectances under a grey specular
-    layer)."""
+    layer). Auto is spectral for pictures of many bands, otherwise neural."""
     num_endmembers: Annotated[int | Auto | None, CommonFlag, short_flag("endmembers")] = None
     """Of spectral materials: K, how many reflectances are mixed; auto proposes it from the training pixels. None is the
     number of --pipeline.model.from-run, otherwise 6, or the number of bands if that is smaller."""
     endmember_init: Annotated[EndmemberMethod, AtStartOnly] = "pairs"
     """Of spectral materials: first guess of the endmembers, from the pixels divided by the light that reaches them."""
-    from_run: Annotated[Path | None, CommonFlag, AtStartOnly] = None
-    """Of spectral materials: run of unmix-nerf whose endmembers and abundances the fit starts from."""
+    from_run: Annotated[Path | None, CommonFlag, AtStartOnly, short_flag("from-run")] = None
+    """Of spectral materials: run of unmix-nerf whose endmembers and abundances the fit starts from. Without --data its
+    mesh, cameras and pictures are those of the run, too."""
     samples: Annotated[int, CommonFlag] = 16
     """Paths a pixel in training, in two independent halves; more is slower and less noisy. Few leave a bias, since tone
     curves bend: at equal time, 16 in half as many pixels did better than 8, and 4 in twice as many worse."""
@@ -157,7 +158,7 @@ class NeumatexModelConfig(ModelConfig):
             Check(
                 ("material", "from_run"),
                 "from-run with the material spectral only",
-                self.from_run is None or self.material == "spectral",
+                self.from_run is None or self.material in ("spectral", "auto"),
             ),
         ]
         require("the model", self, rules)
@@ -165,8 +166,12 @@ class NeumatexModelConfig(ModelConfig):
     def resolve_auto(
         self, initial_data: Callable[[], Mapping[str, np.ndarray]], generator: torch.Generator
     ) -> tuple[NeumatexModelConfig, str]:
-        """With a number of endmembers, where the material is spectral. Raises SpectrumError: no pixel is neither dark
-        nor saturated. Raises ConfigError, RunError: the run to start from is unusable."""
+        """With a family of materials, and a number of endmembers where it is spectral. Raises SpectrumError: no pixel
+        is neither dark nor saturated. Raises ConfigError, RunError: the run to start from is unusable."""
+        if self.material == "auto":
+            is_spectral = self.from_run is not None or "lamp" in initial_data()
+            chosen = replace(self, material="spectral" if is_spectral else "neural")
+            return chosen.resolve_auto(initial_data, generator)
         if self.material != "spectral" or isinstance(self.num_endmembers, int):
             return self, ""
         arrays = initial_data()

@@ -1,0 +1,116 @@
+"""An object made of a run of unmix-nerf: its files, what overrides them, and a training on nothing but the run."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from tests.commands.running import done, refused, run_of
+from tests.neumatex.factory import CENTRE, RADIUS, SMALL, WAVELENGTHS, write_light, write_spectral_object
+from unmix_plugin.commands.train import train
+from unmix_plugin.engine import load_config
+from unmix_plugin.errors import ConfigError, SceneError
+from unmix_plugin.neumatex.fit.data_manager import ObjectDataManagerConfig
+from unmix_plugin.neumatex.fit.object_scene import load_object
+from unmix_plugin.neumatex.fit.settings import NeumatexModelConfig
+from unmix_plugin.neumatex.from_run.object_folder import ObjectRecipe, object_of_run
+
+WORDS = ["--endmembers", 2, "--device", "cpu", "--poses", "fixed", "--max-num-iterations", 60]
+
+
+@pytest.fixture(scope="module")
+def ball(tmp_path_factory):
+    """A scene without a mesh, with the light beside it, and a run of unmix-nerf on it."""
+    folder = write_spectral_object(tmp_path_factory.mktemp("ball") / "ball")
+    (folder / "mesh.ply").unlink()
+    return folder, run_of(
+        done(train, "unmix-nerf", "--data", folder, "--output-dir", folder.parent / "out", *WORDS)
+    )
+
+
+def test_the_object_of_a_run_is_a_folder_that_neumatex_reads(ball):
+    scene, run = ball
+    said = list[str]()
+    folder = object_of_run(ObjectRecipe(run, 500), said.append)
+    found = load_object(folder)
+    mesh = trimesh.load(folder / "mesh.ply")
+    assert len(mesh.faces) <= 500
+    assert mesh.is_watertight
+    assert np.linalg.norm(mesh.vertices.mean(axis=0) - CENTRE) < 0.2
+    assert abs(np.linalg.norm(mesh.vertices - CENTRE, axis=1).mean() - RADIUS) < 0.1
+    assert np.allclose(found.bands.centers_nm, WAVELENGTHS)
+    assert np.array_equal(found.pictures.read(1).numbers > 0, load_cube(scene, 1) > 0)
+    assert [light.name for light in found.lights] == ["dim"]
+    assert found.true_materials is not None
+    assert [each.subject for each in found.decisions] == ["mesh"]
+    assert any("triangles" in line for line in said)
+    said.clear()
+    assert object_of_run(ObjectRecipe(run, 500), said.append) == folder
+    assert not said  # it was there
+    assert object_of_run(ObjectRecipe(run, 300), said.append) != folder
+
+
+def load_cube(scene, index):
+    return np.load(scene / "cubes" / f"{index:03d}.npy")
+
+
+def test_a_run_alone_is_enough_to_train(ball, tmp_path):
+    words = ["--from-run", ball[1], "--mesh-triangles", 500, "--output-dir", tmp_path, *SMALL]
+    trained = run_of(done(train, "neumatex", *words, "--max-num-iterations", 2))
+    config = load_config(trained)
+    assert config.data is not None
+    assert (config.data / "mesh.ply").is_file()
+    assert config.pipeline.model.material == "spectral"
+    assert config.pipeline.model.num_endmembers == 2
+    assert "closed surface of the run" in (trained / "run.log").read_text()
+    resumed = run_of(done(train, "neumatex", "--load-run", trained, "--max-num-iterations", 3))
+    assert resumed == trained
+
+
+def test_a_mesh_and_an_environment_that_are_given_take_the_place_of_the_runs(ball, tmp_path):
+    mesh = tmp_path / "own.ply"
+    own = trimesh.creation.icosphere(subdivisions=2, radius=RADIUS)
+    own.apply_translation(CENTRE)
+    own.export(mesh)
+    light = write_light(tmp_path, sky=2.0)
+    folder = object_of_run(ObjectRecipe(ball[1], 500, mesh, light), lambda _: None)
+    assert not list(folder.glob("mesh.*"))
+    assert not list(folder.glob("environment.*"))
+    found = load_object(folder, mesh=mesh, environment=light)
+    assert len(found.mesh.faces) == len(own.faces)
+    assert float(found.environment.image.max()) == pytest.approx(2.0, rel=1e-3)
+    assert found.decisions == ()
+
+
+def test_what_a_run_can_not_give_is_refused(ball, tmp_path):
+    scene, run = ball
+    with pytest.raises(SceneError, match=r"there is no such file"):
+        object_of_run(ObjectRecipe(run, 500, tmp_path / "none.ply"), lambda _: None)
+    assert "from-run with the material spectral only" in refused(
+        train, "neumatex", "--from-run", run, "--pipeline.model.material", "pbr"
+    )
+    with pytest.raises(ConfigError, match="mesh-triangles"):
+        ObjectDataManagerConfig(mesh_triangles=3)
+    moved = tmp_path / "moved"
+    shutil.move(scene / "cubes", moved)
+    try:
+        with pytest.raises(SceneError, match="put it back"):
+            object_of_run(ObjectRecipe(run, 501), lambda _: None)
+    finally:
+        shutil.move(moved, scene / "cubes")
+
+
+def test_damaged_decisions_are_named(tmp_path):
+    folder = write_spectral_object(tmp_path / "ball")
+    (folder / "decisions.json").write_text(json.dumps([{"outcome": "no subject"}]))
+    with pytest.raises(SceneError, match=r"decisions\.json: is damaged"):
+        load_object(folder)
+
+
+def test_pictures_of_bands_are_fitted_with_spectral_materials_and_colours_with_neural_ones():
+    for arrays, expected in (({"lamp": np.ones(5)}, "spectral"), ({}, "neural")):
+        settings, _ = NeumatexModelConfig().resolve_auto(lambda arrays=arrays: arrays, torch.Generator())
+        assert settings.material == expected

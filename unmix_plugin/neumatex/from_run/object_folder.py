@@ -1,0 +1,243 @@
+"""The folder of an object, written from a run of unmix-nerf on its pictures: nothing else has to be prepared.
+
+The mesh is the surface that the run has learnt, closed and decimated; cameras are those that it refined; pictures are
+those that it was trained on, as links where the disk allows it. The light is that of the scene's folder where one lies
+there. A mesh or an environment that a user gives takes the place of the run's.
+
+The folder lies in the exports of the run and is named for what it was made of, so that the same is made once.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from unmix_plugin.engine import Decision
+from unmix_plugin.errors import ConfigError, SceneError
+from unmix_plugin.formats.files import make_folder, safe_name, write_file
+from unmix_plugin.formats.meshes import write_ply
+from unmix_plugin.neumatex.fit.object_scene import DECISIONS_FILE
+from unmix_plugin.neumatex.tracing.light_files import ENVIRONMENT_SUFFIXES
+from unmix_plugin.scenes.demo.scene import written_once
+from unmix_plugin.scenes.folder import METRES_KEY, load_transforms, read_scene_keys, transforms_bytes
+from unmix_plugin.scenes.reading.faults import FILE_NAME, Faults, resolve_path, sha256_of
+from unmix_plugin.scenes.scene import Scene
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
+from unmix_plugin.trained.camera_files import camera_entry
+from unmix_plugin.trained.closed_surface import closed_surface
+from unmix_plugin.trained.open_run import LoadedRun, find_scene, load_run
+from unmix_plugin.trained.run_views import positions_for_files
+
+_RECIPE_FILE, _VERSION = "made_of.json", 1
+"""What a folder was made of, written last; the version of how."""
+_MOST_UNSEEN = 0.02
+"""Part of the surface that no camera sees, from which that is worth a word."""
+
+Say = Callable[[str], object]
+"""What to do with a line about the progress."""
+
+
+@dataclass(frozen=True)
+class ObjectRecipe:
+    """What an object is made of."""
+
+    run: Path
+    """Of unmix-nerf."""
+    num_triangles: int
+    """Of the mesh, at most."""
+    mesh: Path | None = None
+    """Given in place of the run's."""
+    environment: Path | None = None
+    """Given in place of the scene's."""
+
+    def described(self, loaded: LoadedRun) -> dict[str, Any]:
+        """All that a change of makes another folder, as JSON has it."""
+        given = {
+            name: None if path is None else sha256_of(path)
+            for name, path in (("mesh", self.mesh), ("environment", self.environment))
+        }
+        step = loaded.training.steps
+        scene = loaded.record.summary.get("input_hashes")
+        return {"version": _VERSION, "step": step, "triangles": self.num_triangles, **given, "scene": scene}
+
+
+def object_of_run(recipe: ObjectRecipe, say: Say) -> Path:
+    """The folder of an object, made if it is not there.
+
+    Raises:
+        RunError: the run is unusable, or has no surface.
+        ConfigError: the run has no mixed materials, or several sensors.
+        SceneError: its scene is gone or has changed, has no light and none was given, or the folder can't be written.
+    """
+    for path in (recipe.mesh, recipe.environment):
+        if path is not None and not path.is_file():
+            raise SceneError(f"{path}: there is no such file")
+    loaded = load_run(recipe.run, "cpu")
+    content = recipe.described(loaded)
+    digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:12]
+    name = safe_name(loaded.scene_name, fallback="object")
+
+    def is_complete(folder: Path) -> bool:
+        with suppress(OSError, ValueError):
+            return json.loads((folder / _RECIPE_FILE).read_text(encoding="utf-8")) == content
+        return False
+
+    def write(folder: Path) -> None:
+        _write_object(make_folder(folder), recipe, loaded, say)
+        write_file(folder / _RECIPE_FILE, json.dumps(content, indent=1).encode())
+
+    target = loaded.folder.exports / f"object-{digest}" / name
+    if not is_complete(target):
+        say(f"object of {recipe.run}: {target}")
+    remedy = "give a copy of the run that can be written"
+    return written_once(target, "the object", write, is_complete, remedy)
+
+
+def _write_object(folder: Path, recipe: ObjectRecipe, loaded: LoadedRun, say: Say) -> None:
+    """Pictures and cameras, then the mesh, then the light."""
+    scene = find_scene(loaded.record.summary, loaded.folder.path, None)
+    if scene is None:
+        raise SceneError(
+            f"{loaded.record.summary.get('root')}: the scene of {recipe.run} is not there any more, or has changed; "
+            "put it back, since the materials are fitted to its pictures"
+        )
+    if scene.is_rig:
+        raise ConfigError(
+            f"{recipe.run}: its pictures are of several sensors or sizes, and an object needs cubes of all bands; "
+            "train unmix-nerf on those of one sensor"
+        )
+    content = _write_pictures(folder, loaded, scene)
+    decisions = list[Decision]()
+    if recipe.mesh is None:
+        decisions.append(_write_mesh(folder, recipe, loaded, say))
+    if recipe.environment is None:
+        content |= _copied_environment(folder, scene)
+    (folder / FILE_NAME).write_bytes(transforms_bytes(content))
+    write_file(folder / DECISIONS_FILE, json.dumps([each.to_json() for each in decisions], indent=1).encode())
+
+
+def _write_pictures(folder: Path, loaded: LoadedRun, scene: Scene) -> dict[str, Any]:
+    """Cubes, pictures, masks, truth and other lights of a scene; the content of transforms.json but for what else is
+    known."""
+    trained, bands = loaded.materials_scene, Bands(scene.wavelengths_nm)
+    views = {view.name: view for view in trained.views}
+    shown = [index for index, frame in enumerate(scene.frames) if frame.name in views]
+    frames = [_write_frame(folder, scene, index) for index in shown]
+    splits: dict[str, list[str]] = {"train": [], "eval": []}
+    for index, frame in zip(shown, frames, strict=True):
+        view = views[scene.frames[index].name]
+        width, height = view.camera.size(0)
+        frame |= {**camera_entry(view, trained.frame), "w": width, "h": height}
+        splits[view.split].append(frame["hyperspectral_file_path"])
+    content: dict[str, Any] = {"camera_model": "OPENCV", "tone_mapping": "linear"}
+    content |= {"train_filenames": splits["train"], "val_filenames": splits["eval"]}
+    content["wavelengths"] = scene.wavelengths_nm.tolist()
+    if _is_clean(scene) and scene.options.value_scale is not None:
+        content["value_scale"] = scene.options.value_scale
+    if scene.illuminant is not None:
+        table = SpectraTable(bands, ("power",), scene.illuminant[None])
+        write_spectra_csv(folder / "illuminant.csv", table)
+        content["illuminant_path"] = "illuminant.csv"
+    if scene.endmembers is not None and scene.material_names is not None:
+        table = SpectraTable(bands, scene.material_names, scene.endmembers)
+        write_spectra_csv(folder / "endmembers.csv", table)
+        content |= {"endmembers_path": "endmembers.csv", "materials": list(scene.material_names)}
+    if loaded.scale is not None:
+        content[METRES_KEY] = loaded.scale.metres_per_unit
+    if (scene.root / "relit").is_dir():
+        shutil.copytree(scene.root / "relit", folder / "relit", copy_function=_link)
+    return {**content, "frames": frames}
+
+
+def _is_clean(scene: Scene) -> bool:
+    """Whether cubes hold light alone, which is all that neumatex takes."""
+    return scene.options.invalid_pixels == "refuse"
+
+
+def _write_frame(folder: Path, scene: Scene, index: int) -> dict[str, Any]:
+    """The files of a view, each in a folder of its kind; gives their keys."""
+    frame, entry = scene.frames[index], dict[str, Any]()
+    files = {
+        "file_path": ("images", frame.image_path),
+        "hyperspectral_file_path": ("cubes", frame.cube_path),
+        "mask_path": ("masks", frame.mask_path),
+        "abundance_file_path": ("abundances", frame.abundance_path),
+    }
+    if not _is_clean(scene):
+        cube, mask = (folder / place / frame.name for place in ("cubes", "masks"))
+        np.save(make_folder(cube.parent) / f"{cube.name}.npy", scene.cube(index))
+        valid = Image.fromarray(scene.valid_mask(index).astype(np.uint8) * 255)
+        valid.save(make_folder(mask.parent) / f"{mask.name}.png")
+        entry = {"hyperspectral_file_path": f"cubes/{cube.name}.npy", "mask_path": f"masks/{mask.name}.png"}
+    for key, (place, path) in files.items():
+        if path is not None and key not in entry:
+            entry[key] = f"{place}/{frame.name}{path.suffix}"
+            _link(path, folder / entry[key])
+    return entry
+
+
+def _link(source: str | Path, target: str | Path) -> str:
+    """A second name of a file, or where the disk has none a copy."""
+    source, target = Path(source).resolve(), Path(target)
+    make_folder(target.parent)
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copyfile(source, target)
+    return str(target)
+
+
+def _write_mesh(folder: Path, recipe: ObjectRecipe, loaded: LoadedRun, say: Say) -> Decision:
+    """The surface of the run in the scene's world."""
+    say("looking for its surface ...")
+    found, frame = closed_surface(loaded.materials_scene, recipe.num_triangles), loaded.scene.frame
+    vertices = positions_for_files(frame.to_world(found.mesh.vertices))
+    columns = {name: vertices[:, axis] for axis, name in enumerate("xyz")}
+    write_ply(folder / "mesh.ply", columns, found.mesh.faces, ("surface of an unmix-nerf run",))
+    unseen = f"{found.unseen:.0%} of it no camera sees, which is closed by a guess: capture the object from there, too"
+    doubt = unseen if found.unseen > _MOST_UNSEEN else "no part of it is unseen"
+    say(f"mesh of {len(found.mesh.faces):,} triangles; {doubt}")
+    return Decision(
+        "mesh",
+        "closed surface of the run",
+        {
+            "triangles": len(found.mesh.faces),
+            "before it was decimated": found.num_found,
+            "part that no camera sees": found.unseen,
+        },
+        "outlines of mesh and alpha that differ, which is refused or noted when training begins",
+        "--mesh",
+    )
+
+
+def _copied_environment(folder: Path, scene: Scene) -> Mapping[str, Any]:
+    """The environment map of a scene's folder, and its keys. Raises SceneError: there is none."""
+    faults = Faults(scene.root)
+    keys = read_scene_keys(load_transforms(scene.root, faults).scene, faults)
+    found = [scene.root / f"environment{suffix}" for suffix in ENVIRONMENT_SUFFIXES]
+    path = next((path for path in found if path.is_file()), None)
+    if keys.environment_path is not None:
+        path = resolve_path(scene.root, keys.environment_path, None, "'environment_path'", faults)
+    faults.raise_if_any()
+    if path is None:
+        raise SceneError(
+            f"{scene.root}: has no environment map, so that the light is not known; give one with --environment"
+        )
+    name = f"environment{path.suffix.lower()}"
+    _link(path, folder / name)
+    placement = {
+        "environment_rotation_deg": keys.environment_rotation_deg,
+        "environment_exposure_stops": keys.environment_exposure_stops,
+    }
+    return {"environment_path": name, **{key: value for key, value in placement.items() if value is not None}}
