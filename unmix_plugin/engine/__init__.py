@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from unmix_plugin.engine.configs import Target as Target
     from unmix_plugin.engine.configs import TrainerConfig as TrainerConfig
     from unmix_plugin.engine.configs import short_flag as short_flag
+    from unmix_plugin.engine.decisions import UNDECIDED as UNDECIDED
     from unmix_plugin.engine.decisions import Decision as Decision
     from unmix_plugin.engine.geometry.camera_paths import nearest_to_axes as nearest_to_axes
     from unmix_plugin.engine.geometry.camera_paths import upright_cameras as upright_cameras
@@ -59,7 +60,7 @@ _MODULES = {
         "TrainerConfig",
         "short_flag",
     ),
-    "decisions": ("Decision",),
+    "decisions": ("UNDECIDED", "Decision"),
     "geometry.camera_paths": ("nearest_to_axes", "upright_cameras"),
     "geometry.cameras": ("Cameras",),
     "geometry.space": ("RayBundle", "SceneBox"),

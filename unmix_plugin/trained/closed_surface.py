@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float, Float32, Float64
 
 from unmix_plugin.errors import RunError
 from unmix_plugin.trained.decimation import decimated
@@ -31,6 +31,8 @@ _REACH_PX = 8.0
 _BLUR_PX = 0.75
 """Standard deviation; sharp edges get as round as this."""
 _NUM_RAYS = 400_000
+_COARSER, _NEAR = 4, 0.5
+"""Cells of the grid that are one of a coarse one; the part of the reach within which distances are measured finely."""
 _SMALLEST_PIECE = 0.005
 """Pieces of less volume, as a part of that of the largest, are stray."""
 
@@ -70,11 +72,12 @@ def closed_surface(
     edge = float((scene.scene_box.aabb[1] - scene.scene_box.aabb[0]).max())
     cells = int(np.clip(round(_CELLS_A_PIXEL * edge / scene.pixel_size), *_CELLS))
     grid = GridPoints.over(scene.scene_box.aabb, cells)
+    coarse = GridPoints.over(scene.scene_box.aabb, max(8, cells // _COARSER))
+    first = np.stack([_distances(seen, coarse.slice_points(index)) for index in range(coarse.shape[0])])
     slices = follow("measuring distances to the surface", range(grid.shape[0]))
-    points = (grid.slice_points(index) for index in slices)
-    parts = [seen.signed_distance(part.flatten(0, 1), _REACH_PX).view(part.shape[:2]) for part in points]
+    parts = [_refined(seen, grid.slice_points(index), coarse, first) for index in slices]
     with working("closing the surface"):
-        distances = gaussian_filter(torch.stack(parts).numpy(), _BLUR_PX * scene.pixel_size / grid.cell)
+        distances = gaussian_filter(np.stack(parts), _BLUR_PX * scene.pixel_size / grid.cell)
         distances = np.pad(distances, 1, constant_values=1.0)  # the box ends what is solid
         distances[np.abs(distances) < 1e-4] = 1e-4  # or triangles without area would tear the mesh
         if not distances.min() < 0 < distances.max():
@@ -87,6 +90,27 @@ def closed_surface(
     areas = mesh.areas()
     unseen = float(areas[~is_seen[mesh.faces].any(axis=1)].sum() / areas.sum())
     return ClosedSurface(mesh, unseen, len(whole.faces))
+
+
+def _distances(seen: SeenSurface, points: Float[torch.Tensor, "Y Z 3"]) -> Float32[np.ndarray, "Y Z"]:
+    return seen.signed_distance(points.flatten(0, 1), _REACH_PX).view(points.shape[:2]).numpy()
+
+
+def _refined(
+    seen: SeenSurface,
+    points: Float[torch.Tensor, "Y Z 3"],
+    coarse: GridPoints,
+    first: Float32[np.ndarray, "a b c"],
+) -> Float32[np.ndarray, "Y Z"]:
+    """Distances at points: measured near the surface, elsewhere interpolated from a coarse grid."""
+    from scipy.ndimage import map_coordinates
+
+    flat = points.flatten(0, 1)
+    places = (flat.numpy() - coarse.origin) / coarse.cell
+    found = map_coordinates(first, places.T, order=1, mode="nearest")
+    near = torch.from_numpy(np.abs(found) < _NEAR)
+    found[near.numpy()] = seen.signed_distance(flat[near], _REACH_PX).numpy()
+    return found.reshape(points.shape[:2])
 
 
 def _without_bubbles(mesh: TriangleMesh) -> TriangleMesh:

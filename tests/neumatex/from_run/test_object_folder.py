@@ -9,12 +9,20 @@ import torch
 import trimesh
 
 from tests.commands.running import done, refused, run_of
-from tests.neumatex.factory import CENTRE, RADIUS, SMALL, WAVELENGTHS, write_light, write_spectral_object
+from tests.neumatex.factory import (
+    CENTRE,
+    LAMP,
+    RADIUS,
+    SMALL,
+    WAVELENGTHS,
+    write_light,
+    write_spectral_object,
+)
 from unmix_plugin.commands.train import train
 from unmix_plugin.engine import load_config
 from unmix_plugin.errors import ConfigError, SceneError
 from unmix_plugin.neumatex.fit.data_manager import ObjectDataManagerConfig
-from unmix_plugin.neumatex.fit.object_scene import load_object
+from unmix_plugin.neumatex.fit.object_scene import LIGHT_UNKNOWN, load_object
 from unmix_plugin.neumatex.fit.settings import NeumatexModelConfig
 from unmix_plugin.neumatex.from_run.object_folder import ObjectRecipe, object_of_run
 
@@ -36,11 +44,12 @@ def test_the_object_of_a_run_is_a_folder_that_neumatex_reads(ball):
     said = list[str]()
     folder = object_of_run(ObjectRecipe(run, 500), said.append)
     found = load_object(folder)
-    mesh = trimesh.load(folder / "mesh.ply")
+    mesh = trimesh.load_mesh(folder / "mesh.ply")
     assert len(mesh.faces) <= 500
     assert mesh.is_watertight
     assert np.linalg.norm(mesh.vertices.mean(axis=0) - CENTRE) < 0.2
     assert abs(np.linalg.norm(mesh.vertices - CENTRE, axis=1).mean() - RADIUS) < 0.1
+    assert found.bands is not None
     assert np.allclose(found.bands.centers_nm, WAVELENGTHS)
     assert np.array_equal(found.pictures.read(1).numbers > 0, load_cube(scene, 1) > 0)
     assert [light.name for light in found.lights] == ["dim"]
@@ -63,6 +72,7 @@ def test_a_run_alone_is_enough_to_train(ball, tmp_path):
     config = load_config(trained)
     assert config.data is not None
     assert (config.data / "mesh.ply").is_file()
+    assert isinstance(config.pipeline.model, NeumatexModelConfig)
     assert config.pipeline.model.material == "spectral"
     assert config.pipeline.model.num_endmembers == 2
     assert "closed surface of the run" in (trained / "run.log").read_text()
@@ -101,6 +111,37 @@ def test_what_a_run_can_not_give_is_refused(ball, tmp_path):
             object_of_run(ObjectRecipe(run, 501), lambda _: None)
     finally:
         shutil.move(moved, scene / "cubes")
+
+
+def test_light_is_estimated_where_none_is_given_and_said_to_be_unknown_where_it_is_even(ball):
+    scene, run = ball
+    (scene / "environment.exr").rename(scene / "elsewhere")
+    try:
+        said = list[str]()
+        folder = object_of_run(ObjectRecipe(run, 400), said.append)
+        named = object_of_run(ObjectRecipe(run, 400, lamp="A"), said.append)
+    finally:
+        (scene / "elsewhere").rename(scene / "environment.exr")
+    found = load_object(folder)
+    light = next(each for each in found.decisions if each.subject == "light")
+    assert light.is_undecided
+    assert light.evidence["spectrum of the lamp"] == "of the scene"
+    assert LIGHT_UNKNOWN in found.notes
+    assert LIGHT_UNKNOWN in said
+    mean = found.environment.mean_radiance().numpy()
+    assert np.allclose(mean / mean.max(), LAMP, atol=1e-3)
+    other = load_object(named)
+    assert other.lamp is not None
+    assert np.all(np.diff(other.lamp) > 0)  # as of an incandescent lamp
+    own = load_object(folder, environment=scene / "environment.exr")
+    assert LIGHT_UNKNOWN not in own.notes
+
+
+def test_a_lamp_that_moves_with_the_camera_is_refused(ball, tmp_path):
+    words = ["--data", ball[0], "--output-dir", tmp_path, *WORDS[:-1], 1, "--light", "camera"]
+    run = run_of(done(train, "unmix-nerf", *words))
+    with pytest.raises(ConfigError, match="moves with the camera"):
+        object_of_run(ObjectRecipe(run, 400), lambda _: None)
 
 
 def test_damaged_decisions_are_named(tmp_path):

@@ -33,7 +33,7 @@ from unmix_plugin.engine import (
 )
 from unmix_plugin.errors import Check, SceneError, require
 from unmix_plugin.formats.files import numbered_apart
-from unmix_plugin.neumatex.fit.object_scene import HeldOutLight, ObjectScene, load_object
+from unmix_plugin.neumatex.fit.object_scene import HeldOutLight, ObjectScene, PosedObject, load_object
 from unmix_plugin.neumatex.fit.settings import ObjectRecord
 from unmix_plugin.neumatex.fit.tone import TONE_MAPPINGS
 from unmix_plugin.neumatex.prior.observations import well_spread
@@ -220,9 +220,9 @@ class ObjectDataManager(DataManager):
         return list(self.object.notes)
 
     @cached_property
-    def _pixels(self) -> _PixelList:
+    def _pixels(self) -> PixelList:
         """Read when training begins: evaluation needs none of it."""
-        return _PixelList(self.object, self.options.max_pixels, self.seed)
+        return PixelList(self.object, self.options.max_pixels, self.seed)
 
     @cached_property
     def _ray_mesh(self) -> RayMesh:
@@ -244,11 +244,11 @@ class ObjectDataManager(DataManager):
         }
 
 
-class _PixelList:
+class PixelList:
     """Pixels of training views that show the mesh and nothing else: `views` (M), `corners` (M 2), column and row, and
     `numbers` (M C)."""
 
-    def __init__(self, scene: ObjectScene, most: int, seed: int) -> None:
+    def __init__(self, scene: ObjectScene | PosedObject, most: int, seed: int) -> None:
         """Read the training views; of more pixels than `most`, so many are drawn."""
         ray_mesh, parts = RayMesh(scene.mesh), []
         generator = torch.Generator().manual_seed(seed)

@@ -124,6 +124,32 @@ class ObjectScene:
         return found
 
 
+@dataclass(frozen=True)
+class PosedObject:
+    """What is known of an object before its light is."""
+
+    root: Path
+    mesh: Mesh
+    """Model space."""
+    frame: Normalisation
+    """From world to model space."""
+    pictures: PosedPictures
+    split: Split
+    bands: Bands | None
+    """Of spectral pictures; None for RGB."""
+    lamp: Float64[np.ndarray, " B"] | None
+    """Relative power of the light, greatest band 1; None where it is unknown."""
+
+
+def load_posed_object(root: Path, mesh: Path | None = None) -> PosedObject:
+    """Read and check an object's folder, which need not have a light; a mesh that is given takes the place of its own.
+    Errors are those of `load_object`."""
+    folder = _read_folder(root, [], needs_mesh=True, mesh=mesh, environment=root)
+    frame, placed, pictures = _placed(folder, [])
+    bands = _bands_of(folder, pictures, None)
+    return PosedObject(root, placed, frame, pictures, folder.split, bands, folder.lamp(bands))
+
+
 def load_object(
     root: Path, lamp: str | None = None, mesh: Path | None = None, environment: Path | None = None
 ) -> ObjectScene:
@@ -159,6 +185,9 @@ def load_object(
         power = mean / mean.max()
     true_materials, abundance_files = (None, ()) if bands is None else _read_truth(root, folder.entry, bands)
     files = (folder.mesh_path, folder.environment_path)
+    given = {name for name, path in (("mesh", mesh), ("light", environment)) if path is not None}
+    decisions = tuple(each for each in read_decisions(root) if each.subject not in given)
+    notes += [LIGHT_UNKNOWN for each in decisions if each.subject == "light" and each.is_undecided]
     scene = ObjectScene(
         root=root,
         mesh=placed_mesh,
@@ -174,13 +203,19 @@ def load_object(
         abundance_files=abundance_files,
         input_hashes={**{path.name: sha256_of(path) for path in files}, **pictures.hashes},
         notes=tuple(notes),
-        decisions=read_decisions(root),
+        decisions=decisions,
     )
     for view in scene.split.evaluation:  # a malformed truth is told before training, not after it
         scene.truth(view)
     return scene
 
 
+LIGHT_UNKNOWN = (
+    "the pictures do not tell where light comes from: no lamp explains shading and shadows clearly better than an even "
+    "sky. Light and reflectance are a guess then: capture some views with a lamp on one side, or a mirrored ball in "
+    "the same light, and give --environment"
+)
+"""What has to be said where the light of an object could not be told."""
 DECISIONS_FILE = "decisions.json"
 """In a folder that was made of a run: what was decided about the object."""
 

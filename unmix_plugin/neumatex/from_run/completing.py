@@ -27,7 +27,7 @@ def completed(config: TrainerConfig) -> TrainerConfig:
     config = replace(config, pipeline=pipeline)
     if config.data is not None or run is None:
         return config
-    recipe = ObjectRecipe(run, data.mesh_triangles, mesh, environment)
+    recipe = ObjectRecipe(run, data.mesh_triangles, mesh, environment, data.lamp)
     return replace(config, data=object_of_run(recipe, lambda line: sys.stderr.write(f"{line}\n")))
 
 

@@ -2,7 +2,8 @@
 
 The mesh is the surface that the run has learnt, closed and decimated; cameras are those that it refined; pictures are
 those that it was trained on, as links where the disk allows it. The light is that of the scene's folder where one lies
-there. A mesh or an environment that a user gives takes the place of the run's.
+there, or else the one that shading and shadows tell. A mesh or an environment that a user gives takes the place of the
+run's.
 
 The folder lies in the exports of the run and is named for what it was made of, so that the same is made once.
 """
@@ -15,23 +16,30 @@ import os
 import shutil
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from PIL import Image
 
 from unmix_plugin.engine import Decision
 from unmix_plugin.errors import ConfigError, SceneError
+from unmix_plugin.formats.exr import write_spectral_exr
 from unmix_plugin.formats.files import make_folder, safe_name, write_file
 from unmix_plugin.formats.meshes import write_ply
-from unmix_plugin.neumatex.fit.object_scene import DECISIONS_FILE
-from unmix_plugin.neumatex.tracing.light_files import ENVIRONMENT_SUFFIXES
+from unmix_plugin.neumatex.fit.data_manager import PixelList
+from unmix_plugin.neumatex.fit.object_scene import DECISIONS_FILE, LIGHT_UNKNOWN, load_posed_object
+from unmix_plugin.neumatex.fit.start import RunMaterials
+from unmix_plugin.neumatex.from_run.light import LitPoints, find_light
+from unmix_plugin.neumatex.tracing.light_files import ENVIRONMENT_SUFFIXES, read_lamp
+from unmix_plugin.neumatex.tracing.rays import RayMesh
 from unmix_plugin.scenes.demo.scene import written_once
 from unmix_plugin.scenes.folder import METRES_KEY, load_transforms, read_scene_keys, transforms_bytes
 from unmix_plugin.scenes.reading.faults import FILE_NAME, Faults, resolve_path, sha256_of
 from unmix_plugin.scenes.scene import Scene
+from unmix_plugin.settings import UnmixModelConfig
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 from unmix_plugin.trained.camera_files import camera_entry
@@ -39,6 +47,8 @@ from unmix_plugin.trained.closed_surface import closed_surface
 from unmix_plugin.trained.open_run import LoadedRun, find_scene, load_run
 from unmix_plugin.trained.run_views import positions_for_files
 
+_NUM_POINTS, _MOST_PIXELS, _SEED = 5000, 2_000_000, 0
+"""Pixels that the light is found from, and of how many they are drawn."""
 _RECIPE_FILE, _VERSION = "made_of.json", 1
 """What a folder was made of, written last; the version of how."""
 _MOST_UNSEEN = 0.02
@@ -59,14 +69,16 @@ class ObjectRecipe:
     mesh: Path | None = None
     """Given in place of the run's."""
     environment: Path | None = None
-    """Given in place of the scene's."""
+    """Given in place of the scene's, or of one that is estimated."""
+    lamp: str | None = None
+    """Spectrum of the light, as `read_lamp` takes it, in place of the scene's."""
 
     def described(self, loaded: LoadedRun) -> dict[str, Any]:
         """All that a change of makes another folder, as JSON has it."""
-        given = {
-            name: None if path is None else sha256_of(path)
-            for name, path in (("mesh", self.mesh), ("environment", self.environment))
-        }
+        table = Path(self.lamp) if self.lamp is not None and Path(self.lamp).is_file() else None
+        files = {"mesh": self.mesh, "environment": self.environment, "lamp": table}
+        given = {name: None if path is None else sha256_of(path) for name, path in files.items()}
+        given = {**given, "named lamp": self.lamp}
         step = loaded.training.steps
         scene = loaded.record.summary.get("input_hashes")
         return {"version": _VERSION, "step": step, "triangles": self.num_triangles, **given, "scene": scene}
@@ -77,8 +89,8 @@ def object_of_run(recipe: ObjectRecipe, say: Say) -> Path:
 
     Raises:
         RunError: the run is unusable, or has no surface.
-        ConfigError: the run has no mixed materials, or several sensors.
-        SceneError: its scene is gone or has changed, has no light and none was given, or the folder can't be written.
+        ConfigError: the run has no mixed materials, several sensors, or light that moves with the camera.
+        SceneError: its scene is gone or has changed, or the folder can't be written.
     """
     for path in (recipe.mesh, recipe.environment):
         if path is not None and not path.is_file():
@@ -117,17 +129,20 @@ def _write_object(folder: Path, recipe: ObjectRecipe, loaded: LoadedRun, say: Sa
             f"{recipe.run}: its pictures are of several sensors or sizes, and an object needs cubes of all bands; "
             "train unmix-nerf on those of one sensor"
         )
-    content = _write_pictures(folder, loaded, scene)
+    if recipe.environment is None:
+        _refuse_moving_lamp(recipe, loaded)
+    content = _write_pictures(folder, recipe, loaded, scene)
     decisions = list[Decision]()
     if recipe.mesh is None:
         decisions.append(_write_mesh(folder, recipe, loaded, say))
-    if recipe.environment is None:
-        content |= _copied_environment(folder, scene)
-    (folder / FILE_NAME).write_bytes(transforms_bytes(content))
+    environment = {} if recipe.environment is not None else _copied_environment(folder, scene)
+    (folder / FILE_NAME).write_bytes(transforms_bytes({**content, **environment}))
+    if recipe.environment is None and not environment:
+        decisions.append(_write_light(folder, recipe, loaded, _white(scene), say))
     write_file(folder / DECISIONS_FILE, json.dumps([each.to_json() for each in decisions], indent=1).encode())
 
 
-def _write_pictures(folder: Path, loaded: LoadedRun, scene: Scene) -> dict[str, Any]:
+def _write_pictures(folder: Path, recipe: ObjectRecipe, loaded: LoadedRun, scene: Scene) -> dict[str, Any]:
     """Cubes, pictures, masks, truth and other lights of a scene; the content of transforms.json but for what else is
     known."""
     trained, bands = loaded.materials_scene, Bands(scene.wavelengths_nm)
@@ -145,8 +160,9 @@ def _write_pictures(folder: Path, loaded: LoadedRun, scene: Scene) -> dict[str, 
     content["wavelengths"] = scene.wavelengths_nm.tolist()
     if _is_clean(scene) and scene.options.value_scale is not None:
         content["value_scale"] = scene.options.value_scale
-    if scene.illuminant is not None:
-        table = SpectraTable(bands, ("power",), scene.illuminant[None])
+    lamp = scene.illuminant if recipe.lamp is None else read_lamp(recipe.lamp, bands)
+    if lamp is not None:
+        table = SpectraTable(bands, ("power",), lamp[None])
         write_spectra_csv(folder / "illuminant.csv", table)
         content["illuminant_path"] = "illuminant.csv"
     if scene.endmembers is not None and scene.material_names is not None:
@@ -221,8 +237,59 @@ def _write_mesh(folder: Path, recipe: ObjectRecipe, loaded: LoadedRun, say: Say)
     )
 
 
+def _refuse_moving_lamp(recipe: ObjectRecipe, loaded: LoadedRun) -> None:
+    """Raise ConfigError where the run's light moves with the camera: a map of the world can't."""
+    model = loaded.config.pipeline.model
+    if isinstance(model, UnmixModelConfig) and model.light == "camera":
+        raise ConfigError(
+            f"{recipe.run}: its light moves with the camera, or the object was turned before a lamp, and neumatex "
+            "takes light that stands still as seen from the object; capture it with a lamp that does, or if the light "
+            "did stand still train the run with --light fixed"
+        )
+
+
+def _white(scene: Scene) -> float | None:
+    """What a white surface reads in the pictures, where they were divided by a white reference; None: unknown."""
+    keys = read_scene_keys(load_transforms(scene.root, Faults(scene.root)).scene, Faults(scene.root))
+    return None if keys.reflectance_of_1 is None else 1 / keys.reflectance_of_1
+
+
+def _write_light(
+    folder: Path, recipe: ObjectRecipe, loaded: LoadedRun, white: float | None, say: Say
+) -> Decision:
+    """The light that shading and shadows on the mesh tell, as an environment map of all bands."""
+    say("looking for its light ...")
+    known = load_posed_object(folder, recipe.mesh)
+    assert known.bands is not None
+    lamp = np.ones(len(known.bands)) if known.lamp is None else known.lamp
+    generator = torch.Generator().manual_seed(_SEED)
+    views, places, spectra = PixelList(known, _MOST_PIXELS, _SEED).draw(_NUM_POINTS, generator)
+    rays = known.pictures.cameras[list(known.split.train)].generate_rays(views, places)
+    ray_mesh = RayMesh(known.mesh)
+    found, points = ray_mesh.seen(rays.origins, rays.directions)
+    run = RunMaterials(recipe.run, loaded.materials_scene)
+    corners = known.frame.to_world(np.concatenate([np.zeros((1, 3)), np.eye(3)]))
+    abundances = run.abundances(points.positions, points.geometric_normals, corners)
+    reflectances = run.reflectances(known.bands, lamp, abundances.shape[1])
+    lit = LitPoints(points, spectra[found], abundances)
+    light = find_light(ray_mesh, lit, reflectances, torch.from_numpy(lamp).float(), white)
+    radiance = light.environment.image.numpy() * lamp.astype(np.float32)
+    about = (
+        "light of an object as shading and shadows on its mesh tell it; +z is the top, +x the middle column"
+    )
+    write_spectral_exr(folder / "environment.exr", radiance, known.bands, None, comments=about)
+    spectrum = (
+        "of the scene"
+        if known.lamp is not None
+        else "unknown, taken as flat: give --pipeline.datamanager.lamp"
+    )
+    decision = replace(light.decision, evidence={**light.decision.evidence, "spectrum of the lamp": spectrum})
+    say(LIGHT_UNKNOWN if decision.is_undecided else f"light: {decision.outcome}")
+    return decision
+
+
 def _copied_environment(folder: Path, scene: Scene) -> Mapping[str, Any]:
-    """The environment map of a scene's folder, and its keys. Raises SceneError: there is none."""
+    """The environment map of a scene's folder as keys of transforms.json; nothing where there is none."""
     faults = Faults(scene.root)
     keys = read_scene_keys(load_transforms(scene.root, faults).scene, faults)
     found = [scene.root / f"environment{suffix}" for suffix in ENVIRONMENT_SUFFIXES]
@@ -231,9 +298,7 @@ def _copied_environment(folder: Path, scene: Scene) -> Mapping[str, Any]:
         path = resolve_path(scene.root, keys.environment_path, None, "'environment_path'", faults)
     faults.raise_if_any()
     if path is None:
-        raise SceneError(
-            f"{scene.root}: has no environment map, so that the light is not known; give one with --environment"
-        )
+        return {}
     name = f"environment{path.suffix.lower()}"
     _link(path, folder / name)
     placement = {

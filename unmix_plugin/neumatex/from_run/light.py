@@ -1,0 +1,304 @@
+"""The light of an object, found from how bright its surface is: a lamp, and a sky of few parameters.
+
+Mesh and abundances are known from a run. A diffuse point p that no light but the first reaches sends
+
+    y_b(p) = lamp_b  rho_b(p)  (L_s V_p(s) n.s + sum_m L_m A_m(p)),   rho = sum_k a_k(p) g_k E_k / lamp
+
+to the eye: V_p is what the tracer says of what stands in the way, s the direction of the lamp, sharp or soft, and A_m
+what one of seven wide patches of sky would give (even light, and light from each side along three axes). All are at
+least 0. For each of many directions s the brightnesses that fit best are found (non-negative least squares), and those
+around the best one are tried again, more finely. The gains g of the endmembers are fitted in turn with the light: a
+radiance field knows spectra, but not how bright a material is beside the shading.
+
+What is told by shading alone is the product of light and reflectance: one factor stays unknown. It is the one with
+which a white surface that the lamp lights best reads 1, as in captures that were divided by a white reference, unless
+some surface would be brighter than white.
+
+Notation: `N` points, `D` directions, `B` bands, `K` endmembers, `M` patches of sky.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from unmix_plugin.engine import UNDECIDED, Decision
+from unmix_plugin.neumatex.tracing.environment import Environment, directions_of_pixels, solid_angles
+from unmix_plugin.neumatex.tracing.rays import RayMesh, SurfacePoints
+
+_NUM_DIRECTIONS = 384
+"""Of the first search: 10 degrees apart."""
+_FINER = ((8.0, 48), (2.5, 48))
+"""Half angles of the cones of the next searches, degrees, and how many directions they have."""
+_SOFT_DEG, _SHARP_DEG = 14.0, 3.0
+"""Standard deviation of a soft lamp, such as a softbox or the glow about the sun; radius of a sharp one."""
+_PATCHES = 7
+_ROUNDS = 8
+"""In which light and gains are fitted in turn: with 3, a low sun left materials on its far side 20 % too bright."""
+_HIGHLIGHTS = 2.5
+"""Robust standard deviations from which a point counts less: highlights and errors of the mesh are no diffuse light."""
+_LEAST_GAIN = 0.2
+"""Part by which a lamp has to lower the squared error of a sky alone, or it is not believed."""
+_LEAST_SHARE = 0.12
+"""Of a lamp in all light that falls on a surface which faces it: less is what interreflections look like."""
+_CLEARLY_WORSE = 1.02
+"""Squared error of lamps more than `_ELSEWHERE_DEG` away over that of the best, from which they are ruled out."""
+_ELSEWHERE_DEG = 40.0
+_HEIGHT = 64
+"""Rows of the environment."""
+_WHITE = 0.95
+"""Reflectance of what is as bright as surfaces get."""
+
+
+@dataclass(frozen=True)
+class LitPoints:
+    """Points of a surface, what is seen of them, and what they are made of."""
+
+    points: SurfacePoints
+    """In the space of the mesh, whose axes are the world's."""
+    spectra: Float[Tensor, "N B"]
+    """Radiance towards the eye."""
+    abundances: Float[Tensor, "N K"]
+    """Summing to 1."""
+
+
+@dataclass(frozen=True)
+class FoundLight:
+    """The light of an object, and how it was decided."""
+
+    environment: Environment
+    """World directions, one number: relative to the lamp's spectrum."""
+    direction: Float64[np.ndarray, "3"] | None
+    """Unit vector to the lamp in the world; None where no direction is believed."""
+    gains: Float64[np.ndarray, " K"]
+    """By which each endmember's reflectance is brighter than it was given."""
+    decision: Decision
+
+
+@torch.no_grad()
+def find_light(
+    ray_mesh: RayMesh,
+    lit: LitPoints,
+    reflectances: Float[Tensor, "K B"],
+    lamp: Float[Tensor, " B"],
+    white: float | None,
+) -> FoundLight:
+    """The light that fits best.
+
+    Args:
+        ray_mesh: Which casts shadows.
+        lit: Enough points, some thousands, with normals on all sides.
+        reflectances: Endmembers over the lamp, of any brightness each.
+        lamp: Its spectrum, greatest band 1.
+        white: What a white surface that is lit best reads, where a reference says so; None: 1 is assumed.
+    """
+    seen = lit.spectra / lamp
+    wide = _fibonacci(_NUM_DIRECTIONS)
+    arriving = _arriving(ray_mesh, lit, wide)
+    patches = _patches(wide)
+    sky = arriving @ patches * (4 / _NUM_DIRECTIONS)  # solid angle of a direction over pi
+    gains = torch.ones(len(reflectances), dtype=torch.float64)
+    weights = torch.ones(len(seen), dtype=torch.float64)
+    softened = arriving @ _soft(wide, wide)
+    fits, best, alone, elsewhere = [_Fit(np.zeros(_PATCHES + 2), math.inf)], wide[0], math.inf, math.inf
+    chosen, mixed, shade, trust = 0, lit.abundances.double(), weights, weights
+    for number in range(_ROUNDS):
+        mixed = lit.abundances.double() @ (gains[:, None] * reflectances.double())
+        albedo = mixed.norm(dim=1)
+        shade = (seen.double() * mixed).sum(dim=1) / (albedo * albedo).clamp(min=1e-12)
+        trust = weights * albedo
+        alone = _fitted(sky, [], shade, trust)[0].error
+        errors = torch.tensor([each.error for each in _fitted(sky, [arriving, softened], shade, trust)])
+        best = wide[int(errors.argmin())]
+        far = wide @ best < math.cos(math.radians(_ELSEWHERE_DEG))
+        elsewhere = float(errors[far].min())
+        sharp, soft = arriving, softened
+        for half_angle, count in _FINER:
+            near = _cone(best, half_angle, count)
+            sharp, soft = _arriving(ray_mesh, lit, near), arriving @ _soft(wide, near)
+            fits = _fitted(sky, [sharp, soft], shade, trust)
+            chosen = min(range(count), key=lambda index: fits[index].error)
+            best = near[chosen]
+        columns = torch.cat([sky, sharp[:, [chosen]], soft[:, [chosen]]], dim=1).double()
+        light = columns @ torch.from_numpy(fits[chosen].values)
+        off = (shade - light).abs() / light.clamp(min=1e-6)
+        usual = off.median().clamp(min=1e-6) / 0.6745
+        if number < _ROUNDS - 1:
+            weights = (_HIGHLIGHTS * usual / off.clamp(min=1e-9)).clamp(max=1)
+            gains = _gains(lit.abundances, reflectances, light, seen, weights)
+    fit = fits[chosen]
+    share = float(fit.values[_PATCHES:].sum() / max(fit.values.sum(), 1e-12))
+    is_better = fit.error < (1 - _LEAST_GAIN) * alone and elsewhere > _CLEARLY_WORSE * fit.error
+    is_believed = is_better and share > _LEAST_SHARE
+    evidence: dict[str, float | int | bool | str] = {
+        "squared error over that of a sky alone": fit.error / alone,
+        "best lamp elsewhere over the best": elsewhere / fit.error,
+        "lamp over all light": share,
+    }
+    if not is_believed:
+        fit = _fitted(sky, [], shade, trust)[0]
+        fit = _Fit(np.append(fit.values, [0.0, 0.0]), fit.error)
+    towards = best.double().numpy()
+    scale, assumed = _scale(fit, patches, wide, best, mixed, white)
+    environment = Environment((scale * _radiance(fit, best)).float()[..., None])
+    evidence["brightness of white"] = "assumed" if assumed else "by the white reference"
+    decision = Decision(
+        "light",
+        f"a lamp at {_place(towards)}, and sky" if is_believed else UNDECIDED,
+        evidence,
+        "a sky alone that explains shading and shadows nearly as well, or a lamp elsewhere that does",
+        "--environment",
+    )
+    return FoundLight(environment, towards if is_believed else None, (gains / scale).numpy(), decision)
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Brightness of each part of the light, and what is left unexplained."""
+
+    values: Float64[np.ndarray, " n"]
+    """What a white surface reads that faces it: patches, the sharp lamp, the soft one."""
+    error: float
+    """Mean squared error of the shading, weighted."""
+
+
+def _fitted(
+    sky: Float[Tensor, "N M"],
+    lamps: list[Float[Tensor, "N D"]],
+    shade: Float[Tensor, " N"],
+    trust: Float[Tensor, " N"],
+) -> list[_Fit]:
+    """The best brightnesses, at least 0, of the sky with one column of each of the lamps, for each of their columns; of
+    the sky alone without lamps."""
+    from scipy.optimize import nnls
+
+    wide, wanted = sky.double() * trust[:, None], shade * trust
+    own = [lamp.double() * trust[:, None] for lamp in lamps]
+    total, power = float((trust * trust).sum()), float(wanted @ wanted)
+    size = sky.shape[1] + len(lamps)
+    grams = torch.zeros(own[0].shape[1] if own else 1, size, size, dtype=torch.float64)
+    rights = torch.zeros(len(grams), size, dtype=torch.float64)
+    first = sky.shape[1]
+    grams[:, :first, :first], rights[:, :first] = wide.T @ wide, wide.T @ wanted
+    for row, lamp in enumerate(own, start=first):
+        grams[:, row, :first] = lamp.T @ wide
+        grams[:, :first, row] = grams[:, row, :first]
+        rights[:, row] = lamp.T @ wanted
+        for column, other in enumerate(own, start=first):
+            grams[:, row, column] = (lamp * other).sum(dim=0)
+    # |A x - y|^2 by the normal equations, of which a Cholesky factor is a small system with the same answer.
+    ridge = 1e-9 * grams.diagonal(dim1=1, dim2=2).mean() * torch.eye(size, dtype=torch.float64)
+    factors = torch.linalg.cholesky(grams + ridge)
+    sides = torch.linalg.solve_triangular(factors, rights[..., None], upper=False)[..., 0]
+    found = []
+    for gram, right, factor, side in zip(
+        *(part.numpy() for part in (grams, rights, factors, sides)), strict=True
+    ):
+        values, _ = nnls(factor.T, side)
+        found.append(_Fit(values, float(power - 2 * right @ values + values @ gram @ values) / total))
+    return found
+
+
+def _gains(
+    abundances: Float[Tensor, "N K"],
+    reflectances: Float[Tensor, "K B"],
+    light: Float[Tensor, " N"],
+    seen: Float[Tensor, "N B"],
+    weights: Float[Tensor, " N"],
+) -> Float[Tensor, " K"]:
+    """How bright each endmember is, 1 in the mean, when so much light falls on each point."""
+    from scipy.optimize import nnls
+
+    lit = abundances.double() * (light * weights)[:, None]
+    alike = reflectances.double() @ reflectances.double().T
+    gram = (lit.T @ lit) * alike
+    right = (lit * ((seen.double() * weights[:, None]) @ reflectances.double().T)).sum(dim=0)
+    # Endmembers that hardly any point shows stay as bright as the others.
+    ridge = 1e-3 * gram.diagonal().mean()
+    found, _ = nnls((gram + ridge * torch.eye(len(gram))).numpy(), (right + ridge).numpy())
+    return torch.from_numpy(found / max(found.mean(), 1e-12)).clamp(min=1e-2)
+
+
+def _arriving(ray_mesh: RayMesh, lit: LitPoints, directions: Float[Tensor, "D 3"]) -> Float[Tensor, "N D"]:
+    """Cosines of directions of the world at points, 0 where the mesh is in the way."""
+    points = lit.points
+    cosines = (points.normals @ directions.T).clamp(min=0) * (points.geometric_normals @ directions.T > 0)
+    rows, columns = (cosines > 0).nonzero(as_tuple=True)
+    cosines[rows, columns] *= ~ray_mesh.blocked(points.positions[rows], directions[columns])
+    return cosines
+
+
+def _fibonacci(count: int) -> Float[Tensor, "D 3"]:
+    """Directions evenly spread over the sphere."""
+    index = torch.arange(count, dtype=torch.float64) + 0.5
+    z, azimuth = 1 - 2 * index / count, index * math.pi * (3 - math.sqrt(5))
+    flat = (1 - z * z).sqrt()
+    return torch.stack([flat * azimuth.cos(), flat * azimuth.sin(), z], dim=1).float()
+
+
+def _cone(axis: Float[Tensor, "3"], half_angle_deg: float, count: int) -> Float[Tensor, "D 3"]:
+    """Directions evenly spread about an axis, which is the first."""
+    index = torch.arange(count, dtype=torch.float64)
+    radius = math.tan(math.radians(half_angle_deg)) * (index / max(count - 1, 1)).sqrt()
+    azimuth = index * math.pi * (3 - math.sqrt(5))
+    first = normalize(torch.linalg.cross(axis, torch.eye(3)[int(axis.abs().argmin())]), dim=0)
+    beside = torch.stack([first, torch.linalg.cross(axis, first)]).double()
+    offsets = torch.stack([radius * azimuth.cos(), radius * azimuth.sin()], dim=1) @ beside
+    return normalize(axis.double() + offsets, dim=1).float()
+
+
+def _patches(directions: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n M"]:
+    """Radiance of each patch of sky: even light, then the cosines to both ends of each axis."""
+    both = torch.cat([directions, -directions], dim=-1).clamp(min=0)
+    return torch.cat([torch.ones_like(both[..., :1]), both], dim=-1)
+
+
+def _soft(directions: Float[Tensor, "D 3"], towards: Float[Tensor, "n 3"]) -> Float[Tensor, "D n"]:
+    """Parts of soft lamps' light from each direction, summing to 1 for each lamp."""
+    sharpness = 1 / math.radians(_SOFT_DEG) ** 2
+    lobes = (sharpness * (directions @ towards.T - 1)).exp()
+    return lobes / lobes.sum(dim=0)
+
+
+def _radiance(fit: _Fit, towards: Float[Tensor, "3"]) -> Float64[Tensor, "H W"]:
+    """Of every direction of the world."""
+    directions = directions_of_pixels(_HEIGHT, 2 * _HEIGHT)
+    angles = solid_angles(_HEIGHT, 2 * _HEIGHT)[:, None]
+    sky = _patches(directions).double() @ torch.from_numpy(fit.values[:_PATCHES])
+    cosines = (directions @ towards).double()
+    edge = math.cos(math.radians(max(_SHARP_DEG, 0.75 * 180 / _HEIGHT)))
+    disc = (cosines > edge).double()
+    lobe = ((cosines - 1) / math.radians(_SOFT_DEG) ** 2).exp()
+    for shape, value in ((disc, fit.values[_PATCHES]), (lobe, fit.values[_PATCHES + 1])):
+        # A white surface sends back what arrives over pi.
+        sky = sky + value * math.pi * shape / (shape * angles * cosines.clamp(min=0)).sum()
+    return sky
+
+
+def _scale(
+    fit: _Fit,
+    patches: Float[Tensor, "D M"],
+    wide: Float[Tensor, "D 3"],
+    towards: Float[Tensor, "3"],
+    mixed: Float[Tensor, "N B"],
+    white: float | None,
+) -> tuple[float, bool]:
+    """Factor of the light, by which reflectances are divided, and whether it is assumed."""
+    cosines = (wide @ wide.T).clamp(min=0)
+    reads = (cosines @ patches).double() @ torch.from_numpy(fit.values[:_PATCHES]) * (4 / len(wide))
+    lamps = float(fit.values[_PATCHES:].sum())
+    reads = reads + lamps * (wide @ towards).clamp(min=0)
+    wanted = (1.0 if white is None else white) / float(reads.max())
+    brightest = float(mixed.mean(dim=1).quantile(0.99))
+    return max(wanted, brightest / _WHITE) if white is None else wanted, white is None
+
+
+def _place(towards: Float64[np.ndarray, "3"]) -> str:
+    azimuth, elevation = math.degrees(math.atan2(towards[1], towards[0])), math.degrees(math.asin(towards[2]))
+    return f"azimuth {azimuth:.0f} degrees, elevation {elevation:.0f} degrees"
