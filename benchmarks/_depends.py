@@ -6,6 +6,7 @@
 from pathlib import Path
 
 DEPENDS_ON: dict[str, tuple[str, ...]] = {
+    "asset": ("neumatex", "trained", "rendering", "field.py", "model.py"),
     "backdrops": ("captures", "scenes"),
     "band_cost": ("rendering", "operators", "model.py", "field.py"),
     "captures": ("captures",),

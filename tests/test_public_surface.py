@@ -20,6 +20,7 @@ from unmix_plugin import engine
 
 RECORD = Path(__file__).with_name("public_surface.txt")
 COMMANDS = {
+    "unmix-asset": ("asset", "asset"),
     "unmix-compare": ("compare", "compare"),
     "unmix-demo": ("demo", "demo"),
     "unmix-demo-scene": ("demo_scene", "write_demo_scene"),

@@ -17,6 +17,7 @@ def _run(module: str, command: str) -> NoReturn:
     run_command(lambda words: getattr(import_module(f"unmix_plugin.commands.{module}"), command)(words))
 
 
+asset = partial(_run, "asset", "asset")
 compare = partial(_run, "compare", "compare")
 train = partial(_run, "train", "train")
 evaluate = partial(_run, "eval", "evaluate")

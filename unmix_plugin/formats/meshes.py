@@ -306,6 +306,7 @@ def write_textured_glb(
     base_colour_png: bytes,
     metallic_roughness_png: bytes,
     extras: Mapping[str, Any],
+    up: Float64[np.ndarray, "3"] = _Y,
 ) -> Path:
     """Write a mesh with its material, a picture of sRGB colours and a linear one, green roughness, blue metallicity.
 
@@ -316,7 +317,7 @@ def write_textured_glb(
     material = {"name": "material", "doubleSided": True, "pbrMetallicRoughness": look}
     attributes = {"POSITION": positions, "NORMAL": normals, "TEXCOORD_0": uv}
     pictures = {"base_colour": base_colour_png, "metallic_roughness": metallic_roughness_png}
-    return _write_glb(path, attributes, faces, [material], pictures, extras)
+    return _write_glb(path, attributes, faces, [material], pictures, extras, up)
 
 
 def _write_glb(

@@ -17,6 +17,7 @@ from unmix_plugin.neumatex.export.material import material_paths, write_material
 from unmix_plugin.neumatex.export.pbr_fit import fit_pbr
 from unmix_plugin.neumatex.export.product import MaterialProduct
 from unmix_plugin.neumatex.tracing.families import LayeredFamily, PbrFamily
+from unmix_plugin.neumatex.tracing.mesh import read_mesh
 from unmix_plugin.products.atlas import Atlas, texels_of, unwrap
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.colour.conversion import srgb_to_linear
@@ -82,6 +83,19 @@ def test_the_gltf_is_the_mesh_in_the_world_in_metres_where_the_scale_is_known(wr
     write_material(tmp_path, mesh, PBR, FRAME, 256, metres_per_unit=0.001)
     metres = loaded_mesh(tmp_path / "material.glb").vertices
     np.testing.assert_allclose(metres, 0.001 * np.asarray(loaded.vertices), atol=1e-7)
+
+
+@needs_xatlas
+def test_what_is_up_in_the_world_is_y_in_the_gltf_and_read_back_as_it_was(tmp_path):
+    mesh = knot()
+    write_material(tmp_path, mesh, PBR, FRAME, 256, up=np.array([0.0, 0.0, 1.0]))
+    world = FRAME.to_world(mesh.vertices.double().numpy())[mesh.faces.numpy()]
+    loaded = loaded_mesh(tmp_path / "material.glb")
+    corners = np.asarray(loaded.vertices)[loaded.faces]
+    turned = np.stack([world[..., 0], world[..., 2], -world[..., 1]], axis=-1)
+    np.testing.assert_allclose(corners, turned, atol=1e-5)
+    back = read_mesh(tmp_path / "material.glb").corners().numpy()
+    np.testing.assert_allclose(back, world, atol=1e-5)
 
 
 @needs_xatlas

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from unmix_plugin.formats.exr import write_exr
@@ -37,6 +37,7 @@ from unmix_plugin.trained.run_views import directions_to_world, gltf_positions, 
 
 _TEXTURES = ("base_colour", "gltf_base_colour", "gltf_metallic_roughness")
 _NEURAL_TEXTURES = ("diffuse_colour", "latents_a", "latents_b")
+_AS_IT_IS = np.array([0.0, 1.0, 0.0])
 _CHUNK_BAKING = 1 << 17
 
 
@@ -122,6 +123,7 @@ def write_material(
     texture_size: int,
     bands: Bands | None = None,
     metres_per_unit: float | None = None,
+    up: Float64[np.ndarray, "3"] = _AS_IT_IS,
 ) -> tuple[list[Path], float]:
     """Write a material on a mesh.
 
@@ -130,6 +132,7 @@ def write_material(
         texture_size: Width and height of the textures, texels.
         bands: Of a spectral material.
         metres_per_unit: Of the world, to which glTF is scaled; None: unknown.
+        up: What is up in the world, a unit vector; the node of the glTF turns it to +y. By default nothing is turned.
     Returns:
         The files, and the mean error of the glTF material as a part of the reflected light.
     Raises:
@@ -150,7 +153,8 @@ def write_material(
     if metres_per_unit is not None:
         extras["metres_per_unit"] = metres_per_unit
     shown = (pictures["gltf_base_colour"], pictures["gltf_metallic_roughness"])
-    written.append(_write_glb(folder / "material.glb", mesh, baked.atlas, frame, shown, extras))
+    glb = folder / "material.glb"
+    written.append(_write_glb(glb, mesh, baked.atlas, frame, pictures=shown, extras=extras, up=up))
     report = json.dumps(_report(baked, family, error, textures), indent=1)
     written.append(write_file(folder / "material.json", report.encode()))
     if isinstance(family, NeuralFamily):
@@ -198,15 +202,17 @@ def _write_glb(
     mesh: Mesh,
     atlas: Atlas,
     frame: Normalisation,
+    *,
     pictures: tuple[bytes, bytes],
     extras: dict[str, Any],
+    up: Float64[np.ndarray, "3"],
 ) -> Path:
     """Write the mesh in world coordinates with base colour (sRGB) and metallic-roughness pictures."""
     world = positions_for_files(frame.to_world(mesh.vertices.cpu().double().numpy()))[atlas.vertices]
     positions, offset = gltf_positions(world)
     normals = directions_to_world(frame, mesh.normals.cpu().double().numpy())[atlas.vertices]
     geometry = (positions, normals.astype(np.float32), atlas.uv, atlas.faces)
-    return write_textured_glb(path, *geometry, *pictures, {**extras, **offset})
+    return write_textured_glb(path, *geometry, *pictures, {**extras, **offset}, up)
 
 
 def _report(

@@ -34,6 +34,7 @@ class MaterialProduct(RunProduct):
         from unmix_plugin.neumatex.export.material import material_paths, write_material
         from unmix_plugin.neumatex.fit.trained_object import TrainedObject
         from unmix_plugin.products.mesh import say_units
+        from unmix_plugin.trained.run_views import world_up
 
         scene = job.loaded.scene
         assert isinstance(scene, TrainedObject)  # what else has another method and is refused before
@@ -46,6 +47,7 @@ class MaterialProduct(RunProduct):
                 scene.frame,
                 self.texture_size,
                 bands=scene.bands,
+                up=world_up(scene.views, scene.frame),
                 metres_per_unit=None if job.loaded.scale is None else job.loaded.scale.metres_per_unit,
             )
         message = (
