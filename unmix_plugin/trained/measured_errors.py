@@ -64,9 +64,10 @@ def measure_errors(trained: TrainedScene, measured: MeasuredScene) -> PlaceError
         places = rays.origins.to(trained.device) + seen.ray_distance[:, None] * rays.directions.to(
             trained.device
         )
-        abundances = seen.abundances / seen.accumulation.clamp(min=1e-6)[:, None]
+        opaque = seen.accumulation.clamp(min=1e-6)[:, None]
+        abundances, rendered = seen.abundances / opaque, trained.materials.spectra(seen) / opaque
         of_view = torch.full((len(coords),), number, device=trained.device)
-        found = (places, of_view, trained.materials.spectra(seen), abundances, spectra)
+        found = (places, of_view, rendered, abundances, spectra)
         parts.append([one[kept].cpu() for one in found])
         views += [number] if bool(kept.any()) else []
     if len(views) < 3 or sum(len(part[0]) for part in parts) < _LEAST_PIXELS:
