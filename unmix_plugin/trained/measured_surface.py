@@ -148,14 +148,28 @@ class MeasuredSurface:
         found = errors.over_region(positions[torch.from_numpy(inside)], weights[inside], edge)
         if not bool(found.spectra.isfinite()):
             return found, Interval.unknown(area, COVERAGE, TOO_FEW_VIEWS)
-        if not isinstance(region, OfMaterial):
-            reason = "how exactly edges of boxes and outlines lie on the surface is not measured"
-            return found, Interval.unknown(area, COVERAGE, reason)
-        margins = self._margins(region.material, errors, edge)
         whole = np.bincount(self.mesh.faces.ravel(), np.repeat(self.areas / 3, 3), len(positions))
-        low, high = (np.asarray(whole[margins > sign].sum()) for sign in (1, -1))
+        least = most = weights / np.maximum(whole, 1e-30)
+        if isinstance(region, OfMaterial):
+            margins = self._margins(region.material, errors, edge)
+            least, most = (margins > 1).astype(np.float64), (margins > -1).astype(np.float64)
+        # Outlines are known to about half a pixel, which is how far neighbouring vertices are apart.
+        low, high = (
+            np.asarray(whole @ self._of_neighbours(part, extreme))
+            for part, extreme in ((least, np.minimum), (most, np.maximum))
+        )
         low, high = (np.asarray(end) for end in (np.minimum(low, area), np.maximum(high, area)))
         return found, Interval(low, high, COVERAGE)
+
+    def _of_neighbours(
+        self, values: Float64[np.ndarray, " V"], extreme: np.ufunc
+    ) -> Float64[np.ndarray, " V"]:
+        """The least or greatest value of each vertex and those that share a triangle with it."""
+        found = values.copy()
+        of_faces = extreme.reduce(values[self.mesh.faces], axis=1)
+        for corner in range(3):
+            extreme.at(found, self.mesh.faces[:, corner], of_faces)
+        return found
 
     def _margins(self, material: int, errors: PlaceErrors, edge: float) -> Float64[np.ndarray, " V"]:
         """How far a material is above the largest other one at each vertex, in half widths of the interval that errors
@@ -170,7 +184,8 @@ class MeasuredSurface:
         half = deviations[:, material] + deviations[rows, second]
         half *= width_factor(errors.abundance_factors, COVERAGE) * errors.alike(edge)[0] ** 0.5
         margins = abundances[:, material] - others[rows, second]
-        return np.where(np.isfinite(half), margins / np.maximum(half, 1e-9), np.sign(margins) * np.inf)
+        beyond = np.where(margins > 0, np.inf, -np.inf)
+        return np.where(np.isfinite(half), margins / np.maximum(half, 1e-9), beyond)
 
 
 def points_in(
