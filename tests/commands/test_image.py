@@ -42,6 +42,9 @@ def test_spectra_maps_and_shares_are_written_and_said(cube, tmp_path):
     abundances = open_spectral_file(folder / "abundances.hdr").read()
     assert abundances.shape == (20, 20, 3)
     np.testing.assert_allclose(abundances.reshape(-1, 3)[1:].sum(axis=1), 1, atol=1e-5)
+    ends = open_spectral_file(folder / "intervals.hdr").read().reshape(-1, 2, 3)[1:]
+    own = abundances.reshape(-1, 3)[1:]
+    assert ((ends[:, 0] <= own + 1e-6) & (own <= ends[:, 1] + 1e-6)).all()
     assert open_spectral_file(folder / "mnf.hdr").read().shape == (20, 20, 2)
     assert len((folder / "mnf.csv").read_text().splitlines()) == 1 + 24
     with (folder / "angles.csv").open() as file:
@@ -53,7 +56,7 @@ def test_spectra_maps_and_shares_are_written_and_said(cube, tmp_path):
     assert "exist already; give --overwrite or another folder" in refused(image, *words)
     assert UNKNOWN_LIGHT not in done(image, *words[:-4], "--overwrite").out
     left = {path.name for path in folder.glob("[!.]*")}
-    assert (len(left), left & {"angles.csv", "mnf.csv", "mnf.hdr", "mnf.img"}) == (7, set())
+    assert (len(left), left & {"angles.csv", "mnf.csv", "mnf.hdr", "mnf.img"}) == (9, set())
 
 
 def test_files_that_only_other_options_write_are_not_taken_away_unasked(cube, tmp_path):
