@@ -90,9 +90,10 @@ def main(options: Options) -> None:
     size, views, bands = (24, 8, 8) if options.quick else (options.size, options.views, options.bands)
     times = (3.0, 2.0) if options.quick else (options.field_seconds, options.material_seconds)
     seeds = options.seeds[:1] if options.quick else (*options.seeds, *options.kept_apart)
+    apart = ", ".join(str(seed) for seed in seeds if seed in options.kept_apart)
     setting = {
         "objects": f"procedural, {NUM_MATERIALS} materials, clear sky; seeds {', '.join(map(str, seeds))}, of which "
-        f"{', '.join(map(str, options.kept_apart))} are kept apart",
+        f"are kept apart: {apart or 'none'}",
         "pictures": f"{views} of {size} x {size} pixels, {bands} bands; 2 held-out lights",
         "training": f"field {times[0]:g} s, materials {times[1]:g} s",
         "device": options.device,
@@ -109,7 +110,14 @@ def main(options: Options) -> None:
                 if way == ALONE:
                     found = make_asset(capture, truth, root / "runs", times, options.device)
                 else:
-                    found = fit_given(rows_of(measured, seed)["field"], capture, way, root / "runs", times[1])
+                    found = fit_given(
+                        rows_of(measured, seed)["field"],
+                        capture,
+                        WAYS[way],
+                        root / "runs",
+                        times[1],
+                        options.device,
+                    )
                 rows.append({"seed": seed, **found})
                 print(f"object {seed}, {way}: {found}", flush=True)
     question = "Relit pictures, reflectance, mesh and light of objects that are made of cubes alone"
@@ -179,14 +187,17 @@ def make_asset(
     return {**found, "light": decided["light"], "field": content["runs"]["field"]}
 
 
-def fit_given(field: str, capture: Path, way: str, runs: Path, seconds: float) -> dict[str, Any]:
+def fit_given(
+    field: str, capture: Path, given: tuple[str, ...], runs: Path, seconds: float, device: str
+) -> dict[str, Any]:
     """Figures of materials fitted from a field, with some of the truth given."""
     files = {"mesh": "mesh.glb", "environment": "environment.exr"}
     words = ["neumatex", "--from-run", field, "--max-seconds", f"{seconds:g}", "--output-dir", str(runs)]
-    for name in WAYS[way]:
+    words += ["--device", device]
+    for name in given:
         words += [f"--{name}", str(capture / "given" / files[name])]
     trained = _common.run_command([_common.console_script("unmix-train"), *words])
-    _common.run_command([_common.console_script("unmix-eval"), "--run", str(trained.run)])
+    _common.run_command([_common.console_script("unmix-eval"), "--run", str(trained.run), "--device", device])
     figures = json.loads((trained.run / "eval" / "metrics.json").read_text(encoding="utf-8"))
     return {name: figures.get(name) for name in COLUMNS}
 
