@@ -61,3 +61,17 @@ def test_raw_writes_a_capture_and_names_the_command_that_makes_a_scene_of_it(tmp
     references = ["--white", f"{capture}/white.hdr", "--dark", f"{capture}/dark.hdr"]
     assert words[6:] == [*references, "--poses", "estimate"]
     assert not (capture / "transforms.json").exists()
+
+
+def test_lines_writes_scans_and_names_the_command_that_makes_a_scene_of_them(tmp_path):
+    capture = tmp_path / "scans"
+    printed = done(write_demo_scene, "--lines", capture, "--size", "16", "--bands", "10", "--views", "4").out
+    assert "4 raw scans of 16 lines, 16 columns and 10 bands, 3 of them bad" in printed
+    shown = ("view_000.hdr", "white.hdr", "dark.hdr", "stages.csv", "poses-true.csv", "truth")
+    assert all((capture / name).exists() for name in shown)
+    assert all(f"  {capture / name}  " in printed for name in shown)
+    words = shlex.split(printed.splitlines()[-1].partition(": ")[2])
+    assert words[:6] == ["unmix-process", "lines", "--data", str(capture), "--output-dir", "SCENE"]
+    assert words[-4:] == ["--poses", f"{capture}/stages.csv", "--field-of-view", "38"]
+    assert "give one of them" in refused(write_demo_scene, "--lines", "--raw", tmp_path / "both")
+    assert "--place world" in refused(write_demo_scene, "--lines", tmp_path / "world", "--place", "world")

@@ -13,7 +13,7 @@ Notation: `H x W` pixels, `N` views, `P` points.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -25,6 +25,7 @@ from unmix_plugin.captures.report import Code, Remark
 from unmix_plugin.captures.writing.view_files import ViewRecord
 from unmix_plugin.engine.geometry.camera_paths import meeting_point
 from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.key_poses import KeyPoses
 from unmix_plugin.engine.sampling import evenly_spaced, robust_deviation
 from unmix_plugin.scenes.doctor import check_lenses, check_masks, contradicted_share
 from unmix_plugin.spectral.colour.srgb import decode_srgb
@@ -35,6 +36,8 @@ _NARROW_DEG = 12.0
 _WIDE_RING_DEG = 180.0
 """Part of a circle from which a ring counts as one."""
 _GAP_DEG = 75.0
+_LINES_ASKED = 16
+"""Of a scan, poses that stand for all of its lines."""
 _LEAST_OVERLAP = 0.4
 """Share of a view that another one should see too."""
 _FAR_NEIGHBOUR_DEG = 35.0
@@ -149,7 +152,15 @@ def _cameras(views: Sequence[SeenView], scales: Sequence[float]) -> Cameras:
         poses.append(view.camera.camera_to_world)
         sizes.append(size)
     focal, center, distortion = torch.tensor(np.array(numbers), dtype=torch.float32).split((2, 2, 6), dim=1)
-    return Cameras.of_sizes(torch.from_numpy(np.stack(poses)).float(), focal, center, distortion, sizes)
+    keys = None
+    if any(view.camera.lines is not None for view in views):
+        parts = [view.camera.key_poses for view in views]
+        keys = KeyPoses.join(
+            [replace(part, heights=part.heights * scale) for part, scale in zip(parts, scales, strict=True)]
+        )
+        keys = KeyPoses(keys.poses.float(), keys.heights.float(), keys.counts)
+    poses = torch.from_numpy(np.stack(poses)).float()
+    return Cameras.of_sizes(poses, focal, center, distortion, sizes, keys)
 
 
 def angles_between(views: Sequence[SeenView]) -> Float64[np.ndarray, "N N"]:
@@ -178,8 +189,15 @@ def _of_views(code: Code, names: Sequence[str], **values: str) -> list[Remark]:
 
 
 def _ring(views: Sequence[SeenView], _: _Points | None) -> list[Remark]:
-    """From which sides the cameras look, and what is missing."""
-    poses = np.stack([view.camera.camera_to_world for view in views])
+    """From which sides the cameras look, line cameras at several lines, and what is missing."""
+    poses = np.concatenate(
+        [
+            view.camera.camera_to_world[None]
+            if view.camera.lines is None
+            else view.camera.lines[evenly_spaced(len(view.camera.lines), _LINES_ASKED)]
+            for view in views
+        ]
+    )
     focus = meeting_point(poses)
     if focus is None:
         return [Remark.of(Code.SIDES_UNJUDGED)]
@@ -203,8 +221,10 @@ def _overlap(views: Sequence[SeenView], points: _Points | None) -> list[Remark]:
 
     A grid of rays of each view is followed to the depth of the middle of the scene: where the cameras look, or that of
     the sparse points if they look at no one place. What other cameras see of these places is the overlap, if they look
-    from within 35 degrees.
+    from within 35 degrees. Of line cameras nothing is said.
     """
+    if any(view.camera.lines is not None for view in views):
+        return []
     poses = np.stack([view.camera.camera_to_world for view in views])
     focus = meeting_point(poses)
     if focus is None and points is not None and len(points):

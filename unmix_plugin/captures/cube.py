@@ -257,6 +257,8 @@ class Cube:
     """Of the numbers, the line that is the first of the image."""
     dark_lines: int = 0
     """Lines after the image that were taken with the shutter closed."""
+    lines_per_second: float | None = None
+    """Of a line camera, if the file says so."""
     masks: tuple[Numbers, ...] = field(default=(), repr=False)
     """Of one band or as many as the file, 0 where a pixel holds no measurement."""
 

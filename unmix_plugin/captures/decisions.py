@@ -53,7 +53,9 @@ def decisions_of(
             "poses",
             f"{'estimated' if is_estimated else 'read'}: {posed.poses.source}",
             {"views": used},
-            "points shared by views that lie elsewhere by the poses",
+            "cameras that jump between lines, or look away from each other"
+            if any(camera.lines is not None for camera in posed.poses.cameras.values())
+            else "points shared by views that lie elsewhere by the poses",
             "--poses" if options.poses is None or not is_estimated else "--poses FILE",
         )
     )

@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32, UInt16
 
+from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.runs.replacing import move_files
 from unmix_plugin.errors import ConfigError, install_hint
 from unmix_plugin.formats.envi import UINT16, beside, cube_entries, header_bytes, wavelength_entries
@@ -86,6 +87,15 @@ Backdrop = Callable[[Float[np.ndarray, "R 3"], Float[np.ndarray, "R 3"]], Float[
 """From origins and directions of rays to the light that a grey backdrop sends along them."""
 
 
+@dataclass(frozen=True)
+class PosesFile:
+    """The file of a capture that says where its cameras were, without which it is none."""
+
+    name: str
+    write: Callable[[Path, Cameras], None]
+    """Into a folder; files beside it, too, perhaps."""
+
+
 def make_demo_capture(
     directory: Path,
     size: int = RAW_SIZE,
@@ -95,6 +105,7 @@ def make_demo_capture(
     illuminant: str | Path = RAW_LAMP,
     place: Place | None = None,
     backdrop: Backdrop | None = None,
+    poses: PosesFile | None = None,
     follow: Callable[[str, Sequence[int]], Iterable[int]] = lambda _, items: items,
 ) -> None:
     """Write the demo capture, in place of an older one. It is built beside the folder and moved in when complete.
@@ -105,6 +116,7 @@ def make_demo_capture(
         illuminant: The lamp: the name of a known light, or a CSV file (wavelength,power).
         place: What there is to see, and from where; None is the table with speckles on every surface.
         backdrop: What is behind all things; None is nothing.
+        poses: Where the cameras were; None is `poses-true.json`, a pose a view.
         follow: Gives the items, while it shows how many are done.
     Raises:
         ConfigError: a number out of bounds; a folder with something in it, or no folder at all.
@@ -119,7 +131,8 @@ def make_demo_capture(
     sampling = Bands.of(band_centers_nm(bands))
     lamp = lamp_power(sampling.centers_nm, illuminant)
     cameras, spectra = place.cameras(size, views), reflectances(sampling.centers_nm)
-    with staging_for(directory, "the demo capture", overwrite, POSES) as staging:
+    poses = poses or PosesFile(POSES, _write_frame_poses)
+    with staging_for(directory, "the demo capture", overwrite, poses.name) as staging:
         truth = staging / "truth"
         truth.mkdir()
         write_spectra_csv(truth / "endmembers.csv", SpectraTable(sampling, MATERIALS, spectra))
@@ -131,7 +144,6 @@ def make_demo_capture(
 
         for name, level in (("dark", 0.0), ("white", 1.0)):
             write(name, np.full((_REFERENCE_LINES, size, bands), level, np.float32), f"{name} reference")
-        frames = []
         for index in follow("rendering views", range(views)):
             view, name = render_view(cameras, index, things=place.things), f"view_{index:03d}"
             light = reflected(view, spectra)
@@ -141,10 +153,17 @@ def make_demo_capture(
                 light += ((1 - view.alpha) * behind.reshape(view.alpha.shape))[..., None].astype(np.float32)
             write(name, light, "a view of the demo scene")
             Image.fromarray(label_image(view)).save(truth / f"{name}.png")
-            frames.append({"file_path": f"{name}.hdr", "transform_matrix": transform_matrix(cameras, index)})
-        content = json.dumps(lens_entries(cameras) | {"frames": frames}, indent=1) + "\n"
-        (staging / POSES).write_text(content, encoding="utf-8")
-        move_files(staging, directory, POSES)
+        poses.write(staging, cameras)
+        move_files(staging, directory, poses.name)
+
+
+def _write_frame_poses(folder: Path, cameras: Cameras) -> None:
+    frames = [
+        {"file_path": f"view_{index:03d}.hdr", "transform_matrix": transform_matrix(cameras, index)}
+        for index in range(len(cameras))
+    ]
+    content = json.dumps(lens_entries(cameras) | {"frames": frames}, indent=1) + "\n"
+    (folder / POSES).write_text(content, encoding="utf-8")
 
 
 def marked_place(things: Sequence[Thing] | None = None) -> Place:

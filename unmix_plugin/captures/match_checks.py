@@ -249,7 +249,9 @@ def check_matches(scene: MatchedScene, findings: list[str]) -> str:
     from scipy.optimize import least_squares
 
     stars, lens, count = scene.stars, scene.lens, sum(len(star.ideal) for star in scene.stars)
-    if lens is None or count < _LEAST_POINTS:
+    if lens is None:
+        return "poses and lens are not compared with matched points: lines of one picture have poses of their own"
+    if count < _LEAST_POINTS:
         return "poses and lens are not compared with matched points: too few views share features"
 
     def misses(values: np.ndarray) -> np.ndarray:

@@ -24,6 +24,7 @@ _LAYOUTS = {
     "unmix-nerf": "transforms:find_unmix_nerf",
     "nerfstudio": "transforms:find_nerfstudio",
     "rig": "rig:find_rig",
+    "lines": "cubes:find_lines",
 }
 """Module of layouts/, and the function in it that makes a `Capture` of a folder, imported when it is used."""
 
@@ -35,6 +36,8 @@ GONE_LAYOUTS = {
 
 FROM_PICTURES = ESTIMATE, MARKERS, TURNTABLE = "estimate", "markers", "turntable"
 """Words of --poses that ask to find poses instead of reading them."""
+LINES = "lines"
+"""The layout of line cameras, whose poses are those of lines."""
 _MARKER_SIZES_M = (0.0005, 20.0)
 
 MaskKind = Literal["auto", "files", "white", "black", "none"]
@@ -53,7 +56,15 @@ class ProcessOptions:
     poses: str | None = None
     """Where the cameras were: a file or folder of another program (transforms.json, COLMAP, Metashape, ...); or found
     in the images, by structure from motion (`estimate`), printed markers (`markers`) or the angles of a turned object
-    (`turntable`); without it, the poses of the layout."""
+    (`turntable`); without it, the poses of the layout. Of `lines`, a table with the pose of each line or with a row a
+    scan and what its stage did."""
+    field_of_view: float | None = None
+    """Of the layout `lines`: degrees that a line spans, from the first column to the last."""
+    line_rate: float | None = None
+    """Of the layout `lines`: lines a second, where tables need them; without it, as the files say."""
+    camera_axes: Literal["opengl", "opencv"] = "opengl"
+    """Of the layout `lines`: axes of the camera that rotations in its tables have: OpenGL's (+y up, it looks along -z)
+    or OpenCV's (+y down, it looks along +z)."""
     marker_size: float | None = None
     """Side of a printed marker, metres: gives scale and upright to poses that are found in the images."""
     marker_family: str | None = None
@@ -138,6 +149,22 @@ def check_options(options: ProcessOptions) -> None:
         raise ConfigError(f"--max-noise {options.max_noise:g}: expected a share above 0")
 
 
+def _check_line_options(options: ProcessOptions) -> None:
+    """Raises ConfigError: an option does not go with line cameras, or with others."""
+    if options.layout != LINES:
+        if (options.field_of_view, options.line_rate, options.camera_axes) != (None, None, "opengl"):
+            raise ConfigError(f"--field-of-view, --line-rate and --camera-axes go with the layout '{LINES}'")
+        return
+    if options.poses in FROM_PICTURES:
+        raise ConfigError(
+            f"--poses {options.poses} finds one pose a picture, while each line of a scan has its own; give a table"
+        )
+    if options.known_distance is not None:
+        raise ConfigError("--known-distance follows frame cameras alone; name the unit in the table: x (mm)")
+    if options.line_rate is not None and not 0 < options.line_rate < float("inf"):
+        raise ConfigError(f"--line-rate {options.line_rate:g}: expected lines a second, above 0")
+
+
 def check_pose_options(options: ProcessOptions, names: Sequence[str]) -> None:
     """Refuse what does not go together in finding poses, before anything is computed.
 
@@ -147,6 +174,7 @@ def check_pose_options(options: ProcessOptions, names: Sequence[str]) -> None:
         ConfigError: an option is wrong, or asks for what this way of finding poses does not use.
         CaptureError: a library that is needed is not installed.
     """
+    _check_line_options(options)
     for flag, value in (("--marker-size", options.marker_size), ("--marker-family", options.marker_family)):
         if value is not None and options.poses not in FROM_PICTURES:
             raise ConfigError(f"{flag} goes with --poses {', '.join(FROM_PICTURES)}; give one of them")

@@ -28,8 +28,9 @@ from jaxtyping import Float64
 from unmix_plugin.captures.camera_tags import tag_numbers
 from unmix_plugin.captures.cube import Capture, CaptureView
 from unmix_plugin.captures.names import match_poses
-from unmix_plugin.captures.options import ESTIMATE, MARKERS, TURNTABLE, ProcessOptions
+from unmix_plugin.captures.options import ESTIMATE, LINES, MARKERS, TURNTABLE, ProcessOptions
 from unmix_plugin.captures.poses.lens import Lens
+from unmix_plugin.captures.poses.lines import read_line_poses
 from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera, PoseSet, where_rays_meet
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.captures.report import Code, Kind, Remark, merged, sentences
@@ -78,9 +79,12 @@ class PosedViews:
     """Whose poses are whose, and where the scene lies."""
 
 
-def given_poses(capture: Capture, where: str | None) -> PoseSet:
+def given_poses(capture: Capture, options: ProcessOptions) -> PoseSet:
     """The poses of a file, in the working directory or the capture's folder, or those of the layout. Raises
     CaptureError: there are none, or they can't be read."""
+    where = options.poses
+    if capture.layout == LINES:
+        return read_line_poses(capture.views, capture.root, options)
     if where is None:
         if capture.poses is None:
             why = f" ({capture.no_poses})" if capture.no_poses else ""
@@ -261,7 +265,8 @@ def place_poses(poses: PoseSet, is_flight: bool = False) -> tuple[PoseSet, Place
         middle, how_middle = np.median(points, axis=0), Code.MIDDLE_OF_POINTS
     elif nearest is not None:
         middle, how_middle = nearest, Code.MIDDLE_OF_AXES
-    reach = float(np.linalg.norm(stacked[:, :, 3] - middle, axis=1).max())
+    places = [camera.lines[:, :, 3] for camera in poses.cameras.values() if camera.lines is not None]
+    reach = float(np.linalg.norm(np.concatenate([stacked[:, :, 3], *places]) - middle, axis=1).max())
     scale = 1.0 / reach if reach > 0 else 1.0
 
     # The smallest rotation that takes up to +z.

@@ -83,7 +83,7 @@ def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list
     # Decide: from samples of the views, beside their cameras where these are known already.
     posed = None
     if options.poses not in FROM_PICTURES:
-        posed = pose_views(wanted, given_poses(capture, options.poses), distance)
+        posed = pose_views(wanted, given_poses(capture, options), distance)
     cameras = None if posed is None else posed.poses.cameras
     chosen = wanted if posed is None else posed.views
     plan = make_plan(capture, chosen, options, given=references, cameras=cameras)

@@ -70,6 +70,7 @@ class Code(Enum):
     )
     DARK_LINES_SEVERAL = _doubt("'{entry}' has {count_stated} numbers: dark lines may be left in the image")
     DARK_LINES_NO_NUMBER = _doubt("'{entry}' is {value}, no number: dark lines may be left in the image")
+    LINE_RATE_NO_NUMBER = _done("'{entry}' is {value}, no number: how fast lines were taken is not known")
     NO_DATA_NO_NUMBER = _doubt("'{entry}' is {value}, no number: not used")
     ENTRY_NO_NUMBER = _doubt("{entry} is {value}, no number: not used")
     ENTRY_UNREADABLE = _doubt("{entry} can't be read: not used")

@@ -23,17 +23,20 @@ class _DemoSceneOptions:
     raw: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Write what an instrument would have written instead: raw counts as ENVI cubes, a white reference, a dark frame,
     and no poses; for unmix-process."""
+    lines: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """As --raw, as scans of a line camera on a linear stage and on an arm that goes around, with tables of what the
+    stages did; for unmix-process lines."""
     markers: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """With --raw: lay a board of printed markers around the plate, for --poses markers of unmix-process."""
     size: int | None = None
-    """Width and height of every image, pixels; 96, or 400 with --raw."""
+    """Width and height of every image, pixels; 96, 400 with --raw, 160 with --lines."""
     bands: int | None = None
     """Bands, evenly spaced over 400-700 nm; 31."""
     views: int | None = None
-    """Images on a dome, every 4th for evaluation; 32, or 40 with --raw."""
+    """Images on a dome, every 4th for evaluation; 32, or 40 with --raw. Scans, every 4th from the arm; 24."""
     illuminant: str | None = None
     """What lights the scene: a CIE illuminant (D50, D65, A, E, FL2, ...) or a .csv file (wavelength,power); D50, or A
-    with --raw."""
+    with --raw and --lines."""
     place: Literal["table", "world", "room"] = "table"
     """What is around the table: nothing, so that images have alpha; a ground that runs to the horizon under a sky;
     or a room with windows onto the same world, seen as by a phone held by hand."""
@@ -44,12 +47,19 @@ class _DemoSceneOptions:
 def write_demo_scene(arguments: list[str]) -> None:
     """Parse the arguments, write the scene or the capture, say what is where."""
     options = tyro.cli(_DemoSceneOptions, prog="unmix-demo-scene", args=arguments)
-    if options.raw and options.place != "table":
-        raise ConfigError(f"--raw writes the table alone, not --place {options.place}; leave one of them out")
+    if options.raw and options.lines:
+        raise ConfigError("--raw writes pictures and --lines writes scans; give one of them")
+    flag = "--raw" if options.raw else "--lines"
+    if (options.raw or options.lines) and options.place != "table":
+        raise ConfigError(
+            f"{flag} writes the table alone, not --place {options.place}; leave one of them out"
+        )
     if options.markers and not options.raw:
         raise ConfigError("--markers is for what an instrument would have written; give --raw too")
     if options.raw:
         _write_capture(options)
+    elif options.lines:
+        _write_scans(options)
     else:
         _write_scene(options)
 
@@ -125,6 +135,52 @@ def _write_capture(options: _DemoSceneOptions) -> None:
     words += ["--white", folder / "white.hdr", "--dark", folder / "dark.hdr", "--poses"]
     marked = ["markers", "--marker-size", MARKER_SIZE, "--marker-family", MARKER_FAMILY]
     tell(f"make a scene of it: {shell_line(*words, *(marked if options.markers else ['estimate']))}")
+
+
+def _write_scans(options: _DemoSceneOptions) -> None:
+    from unmix_plugin.captures.demo import RAW_BANDS, RAW_LAMP, make_demo_capture
+    from unmix_plugin.captures.demo_lines import (
+        FIELD_OF_VIEW_DEG,
+        LINE_POSES,
+        LINE_SCANS,
+        LINE_SIZE,
+        SCANNED,
+        STAGES,
+        STAGES_FILE,
+    )
+    from unmix_plugin.commands.reporting import CommandConsole, follow, shell_line
+    from unmix_plugin.spectral.colour.conversion import parse_light
+
+    folder, started = options.directory, time.perf_counter()
+    size, bands, scans = _numbers(options, (LINE_SIZE, RAW_BANDS, LINE_SCANS))
+    make_demo_capture(
+        folder,
+        size,
+        bands,
+        scans,
+        options.overwrite,
+        illuminant=parse_light(options.illuminant or RAW_LAMP),
+        place=SCANNED,
+        poses=STAGES_FILE,
+        follow=partial(follow, CommandConsole()),
+    )
+    tell(
+        f"{folder}: {scans} raw scans of {size} lines, {size} columns and {bands} bands, 3 of them bad, in "
+        f"{time.perf_counter() - started:.1f} s"
+    )
+    for name, content in (
+        ("view_000.hdr", "and .raw, the first scan: counts, uint16, ENVI bil"),
+        ("white.hdr", "white reference"),
+        ("dark.hdr", "dark frame"),
+        (STAGES, "a row a scan: where the camera began, and what the linear stage or the arm did"),
+        (LINE_POSES, "the same as a pose a line"),
+        ("truth", "true materials of each pixel and their reflectances, the lamp's spectrum"),
+    ):
+        tell(f"  {folder / name}  {content}")
+    words = ["unmix-process", "lines", "--data", folder, "--output-dir", "SCENE"]
+    words += ["--white", folder / "white.hdr", "--dark", folder / "dark.hdr"]
+    words += ["--poses", folder / STAGES, "--field-of-view", f"{FIELD_OF_VIEW_DEG:g}"]
+    tell(f"make a scene of it: {shell_line(*words)}")
 
 
 def _numbers(options: _DemoSceneOptions, defaults: tuple[int, int, int]) -> tuple[int, ...]:

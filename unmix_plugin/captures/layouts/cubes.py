@@ -104,6 +104,17 @@ def find_cubes(root: Path, options: ReadOptions) -> Capture:
     return Capture("cubes", root, views, unreadable=unreadable)
 
 
+def find_lines(root: Path, options: ReadOptions) -> Capture:
+    """Layout `lines`: cubes as above, each the scan of a line camera, one row a line. Raises CaptureError: pictures are
+    there in place of scans."""
+    capture = find_cubes(root, options)
+    if pictures := [view.name for view in capture.views if view.cube.is_srgb]:
+        raise CaptureError(
+            f"{root} holds pictures ({name_some(pictures)}) and no scans; expected cubes, such as ENVI's .hdr"
+        )
+    return replace(capture, layout="lines")
+
+
 def _open_views(
     names: Sequence[str],
     paths: Sequence[Path],

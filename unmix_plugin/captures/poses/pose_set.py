@@ -15,9 +15,11 @@ from typing import Any, TypeAlias
 from xml.etree import ElementTree
 
 import numpy as np
+import torch
 from jaxtyping import Float64, UInt8
 
 from unmix_plugin.captures.poses.lens import Lens, require_possible
+from unmix_plugin.engine.geometry.key_poses import KeyPoses
 from unmix_plugin.errors import CaptureError, counted, name_some
 from unmix_plugin.formats.json_values import UnreadableJsonError, read_json_file
 from unmix_plugin.limits import MOST_TABLE_BYTES, parse_xml, read_bounded
@@ -45,22 +47,33 @@ class PosedCamera:
     """Where an image was taken from."""
 
     camera_to_world: Float64[np.ndarray, "3 4"]
-    """Rotation (orthonormal, determinant 1) and position, OpenGL axes: +x right, +y up, looks along -z."""
+    """Rotation (orthonormal, determinant 1) and position, OpenGL axes: +x right, +y up, looks along -z; of a line
+    camera halfway through its image."""
     lens: Lens | None
     """None where the source gives none."""
     other_names: tuple[str, ...] = ()
     """More files of the same image that the source names, such as its cube."""
+    lines: Float64[np.ndarray, "H 3 4"] | None = None
+    """Of a line camera the pose of each line, as `camera_to_world`."""
+
+    @property
+    def key_poses(self) -> KeyPoses:
+        """Poses of lines at their heights in the image, as line cameras have them."""
+        poses = torch.from_numpy(self.camera_to_world[None] if self.lines is None else self.lines)
+        return KeyPoses(poses, torch.arange(len(poses), dtype=poses.dtype) + 0.5, (len(poses),))
 
     def pixels_of(self, points: Float64[np.ndarray, "P 3"]) -> Float64[np.ndarray, "P 2"]:
-        """Where its lens sees points; NaN for points behind the camera."""
+        """Where the lens of a frame camera sees points; NaN for points behind the camera."""
         assert self.lens is not None
+        assert self.lines is None
         x, y, z = ((points - self.camera_to_world[:, 3]) @ self.camera_to_world[:, :3] @ FLIP).T
         depth = np.where(z > 1e-9, z, np.nan)
         return self.lens.pixels_of(np.column_stack([x / depth, y / depth]))
 
     def rays_of(self, pixels: Float64[np.ndarray, "P 2"]) -> Float64[np.ndarray, "P 3"] | None:
-        """Unit directions into which pixels look; None where the lens folds its picture there."""
+        """Unit directions into which pixels of a frame camera look; None where the lens folds its picture there."""
         assert self.lens is not None
+        assert self.lines is None
         ideal = self.lens.ideal_of(pixels)
         if ideal is None:
             return None
@@ -69,9 +82,13 @@ class PosedCamera:
 
     def moved(self, placement: Placement) -> PosedCamera:
         """The camera in the world that a similarity leads to."""
-        pose = self.camera_to_world
-        place = placement.to_scene(pose[:, 3])
-        return replace(self, camera_to_world=np.column_stack([placement.rotation @ pose[:, :3], place]))
+
+        def move(poses: Float64[np.ndarray, "*n 3 4"]) -> Float64[np.ndarray, "*n 3 4"]:
+            places = placement.to_scene(poses[..., 3])
+            return np.concatenate([placement.rotation @ poses[..., :3], places[..., None]], axis=-1)
+
+        lines = None if self.lines is None else move(self.lines)
+        return replace(self, camera_to_world=move(self.camera_to_world), lines=lines)
 
 
 @dataclass(frozen=True)

@@ -42,6 +42,7 @@ _DARK_START = "autodarkstartline"
 """Where cameras of Specim close the shutter at the end of a capture: the first dark line, from 0. Source: NEODAAS,
 run_subtract_darkframes, and ARSF, apl."""
 
+_LINE_RATES = ("fps", "framerate")
 _OF_RESONON = {"shutter", "gain", "framerate"}
 _OF_BANDS = ("wavelength", "wavelength units", "fwhm", "bbl", "band names")
 
@@ -171,7 +172,15 @@ def _described(file: Cube, header_path: Path, header: dict[str, str]) -> Cube:
         reflectance_source="header field 'reflectance scale factor'" if _FACTOR in header else "",
         map_entries=on_map,
         others={**file.others, "header": shown},
+        lines_per_second=_line_rate(header, remarks),
     )
+
+
+def _line_rate(header: dict[str, str], remarks: list[Remark]) -> float | None:
+    """Lines a second. Source: headers of Specim's Lumo (fps) and of Resonon's Spectronon (framerate), both in Hz."""
+    key = next((key for key in _LINE_RATES if key in header), "")
+    stated = _numbers(header, key, Code.LINE_RATE_NO_NUMBER, remarks)
+    return stated[0] if len(stated) == 1 and 0 < stated[0] < float("inf") else None
 
 
 def _numbers(header: dict[str, str], key: str, otherwise: Code, remarks: list[Remark]) -> list[float]:

@@ -23,6 +23,7 @@ from unmix_plugin.captures.cube import CaptureView
 from unmix_plugin.captures.match_checks import MatchedScene, check_matches
 from unmix_plugin.captures.options import ProcessOptions, plain_options
 from unmix_plugin.captures.plan import Plan, SensorPlan
+from unmix_plugin.captures.poses.line_motion import averaged_lines, middle_of
 from unmix_plugin.captures.poses.pose_set import PoseSet
 from unmix_plugin.captures.posing import PosedViews
 from unmix_plugin.captures.report import Kind, Remark, report_text, sentences
@@ -57,13 +58,20 @@ def seen_views(
         if view.name in records:
             record, camera = records[view.name], posed.poses.cameras[view.name]
             assert camera.lens is not None
-            lens = plan.sensors[view.sensor].calibration.raster.lens(camera.lens)
-            seen.append(SeenView(record, replace(camera, lens=lens), folder / record.paths["file_path"]))
+            raster = plan.sensors[view.sensor].calibration.raster
+            camera = replace(camera, lens=raster.lens(camera.lens))
+            if camera.lines is not None:
+                lines = averaged_lines(camera.lines, raster.top, raster.height, raster.binning)
+                camera = replace(camera, camera_to_world=middle_of(lines), lines=lines)
+            seen.append(SeenView(record, camera, folder / record.paths["file_path"]))
     return seen
 
 
 def match_views(seen: Sequence[SeenView]) -> MatchedScene:
-    """What the views share of the sensor that took the most."""
+    """What the views share of the sensor that took the most; nothing is matched between pictures of line cameras, which
+    no fundamental matrix explains."""
+    if any(view.camera.lines is not None for view in seen):
+        return MatchedScene(tuple(view.name for view in seen), (), None)
     greatest = _greatest_sensor(seen)
     same = [view for view in seen if view.record.sensor == greatest]
     return MatchedScene.of([view.name for view in same], [(view.camera, view.picture) for view in same])
@@ -202,8 +210,11 @@ def _transforms_json(
     frames = []
     for written, known in zip(seen, facts, strict=True):
         of_frame = {key: value for key, value in known.items() if key not in shared}
-        pose = matrix_entry(written.camera.camera_to_world)
-        frames.append({**written.record.paths, **of_frame, "transform_matrix": pose})
+        lines = written.camera.lines
+        pose: dict[str, Any] = {"transform_matrix": matrix_entry(written.camera.camera_to_world)}
+        if lines is not None:
+            pose = {"row_poses": [matrix_entry(line) for line in lines]}
+        frames.append({**written.record.paths, **of_frame, **pose})
 
     # Widths of all bands as the files tell them, if all are known and bands are not averaged.
     known_nm: dict[float, float] = {}

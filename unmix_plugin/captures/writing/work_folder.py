@@ -168,6 +168,9 @@ def fingerprint(plan: Plan, options: ProcessOptions) -> dict[str, Any]:
         "marker_family",
         "known_distance",
         "angles",
+        "field_of_view",
+        "line_rate",
+        "camera_axes",
     ]
     fixed = {key: value for key, value in plain_options(options).items() if key not in free}
     files = [path for view in plan.views for path in input_files(view)] + list(plan.option_files)
