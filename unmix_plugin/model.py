@@ -458,7 +458,7 @@ class UnmixModel(Model):
         path = folder / "endmembers.csv"
         for changed in foreign([path]):  # by its user, who goes on with the run: both are kept
             move_aside(changed, "changed")
-        write_spectra_csv(path, self.materials.table())
+        write_spectra_csv(path, self.materials.called_by_colour().table())
 
     @property
     def _training_renderer(self) -> VolumeRenderer:

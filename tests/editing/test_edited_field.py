@@ -149,9 +149,11 @@ def test_a_shaded_material_may_be_brighter_than_white_and_is_as_near_to_a_colour
 
 def test_a_colour_that_pictures_cannot_have_becomes_the_nearest_that_they_can():
     seen = seen_pixels([0.1] * 50 + [0.6] * 10)
-    result = edited(lit_scene(), "retint: {endmember: 0, colour: '#ffffff'}", seen=seen)
+    scene = lit_scene()
+    result = edited(scene, "retint: {endmember: 0, colour: '#ffffff'}", seen=seen)
     [note] = result.notes
-    assert "(retint): pictures of endmember_0 can't be #ffffff in this light; took the nearest colour" in note
+    name = scene.materials.names[0]
+    assert f"(retint): pictures of {name} can't be #ffffff in this light; took the nearest colour" in note
     reached = result.reached_colours["retint", 0]
     assert max(reached) < 0.9
     assert note.endswith(css_colour(reached))

@@ -29,7 +29,7 @@ from unmix_plugin.products.product import Job
 from unmix_plugin.products.scene_products import Mesh
 from unmix_plugin.trained.measures import Scale
 from unmix_plugin.trained.run_views import world_up
-from unmix_plugin.trained.surface import GridPoints, sample_field
+from unmix_plugin.trained.surface import GridPoints, property_names, sample_field
 from unmix_plugin.trained.surface_mesh import (
     TriangleMesh,
     _extract_mesh,
@@ -41,6 +41,7 @@ from unmix_plugin.trained.surface_mesh import (
 )
 
 SCENE = ball_scene()
+ABUNDANCES = property_names(SCENE.materials.names)
 PIXEL = SCENE.pixel_size
 THRESHOLD = -float(np.log(0.5)) / PIXEL
 GRID = GridPoints.over(SCENE.scene_box.aabb, 48)
@@ -212,7 +213,7 @@ def test_ply_and_glb_have_the_same_floats_and_vertices_the_material_of_their_hal
     world = FRAME.to_world(outside.vertices).astype(np.float32)
     np.testing.assert_array_equal(np.stack([vertices[axis] for axis in "xyz"], axis=1), world)
     np.testing.assert_array_equal(np.float32(glb.vertices), world)
-    shares = {f"_ABUNDANCE_ENDMEMBER_{index}": f"abundance_endmember_{index}" for index in range(3)}
+    shares = {f"_{name.upper()}": name for name in ABUNDANCES}
     assert set(glb.vertex_attributes) == {"_MATERIAL", *shares}
     for attribute, name in {"_MATERIAL": "material", **shares}.items():
         np.testing.assert_array_equal(np.float32(np.ravel(glb.vertex_attributes[attribute])), vertices[name])
@@ -244,11 +245,11 @@ def test_textures_show_the_material_of_the_place_that_they_lie_on(textured, file
     uv, away = np.asarray(mesh.visual.uv), np.abs(height) > 0.05
     ids = sampled(Image.open(textured / "mesh_segmentation.png"), uv)
     np.testing.assert_array_equal(ids[away], (height < 0)[away])
-    shares = sampled(Image.open(textured / "mesh_abundance_endmember_0.png"), uv)
+    shares = sampled(Image.open(textured / f"mesh_{ABUNDANCES[0]}.png"), uv)
     np.testing.assert_array_equal(shares[away], 255 * (height > 0)[away])
     vertices = PlyData.read(files[".ply"])["vertex"]
     colours = np.stack([vertices[name] for name in ("red", "green", "blue")], axis=1).astype(int)
-    expected = [colours[vertices[f"abundance_endmember_{index}"].argmax()] for index in (0, 1)]
+    expected = [colours[vertices[ABUNDANCES[index]].argmax()] for index in (0, 1)]
     found = sampled(Image.open(textured / "mesh_colour.png").convert("RGB"), uv)[away].astype(int)
     assert np.abs(found - np.where((height > 0)[away, None], *expected)).max() <= 1
     outwards = mesh.vertices - FRAME.to_world(np.zeros(3))
@@ -259,7 +260,7 @@ def test_textures_show_the_material_of_the_place_that_they_lie_on(textured, file
 def test_a_textured_glb_has_its_segmentation_and_abundances_as_variants(textured):
     data = (textured / "mesh.glb").read_bytes()
     content = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
-    names = ["colour", "segmentation", *(f"abundance_endmember_{index}" for index in range(3))]
+    names = ["colour", "segmentation", *ABUNDANCES]
     variants = content["extensions"]["KHR_materials_variants"]["variants"]
     assert [one["name"] for one in variants] == [one["name"] for one in content["materials"]] == names
     assert content["extensionsUsed"] == ["KHR_materials_variants", "KHR_materials_unlit"]

@@ -29,6 +29,7 @@ from unmix_plugin.products.scene_products import PointCloud
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
+from unmix_plugin.trained.surface import property_names
 
 
 def sphere(count: int, seed: int = 0) -> np.ndarray:
@@ -164,7 +165,7 @@ def test_points_are_in_the_world_of_the_scene_with_unit_normals_out_of_the_surfa
     assert what == "surface points of an unmix-nerf run"
     assert "coordinates: world of the given poses, or of transforms.json if they were estimated" in world
     assert size == "lengths are in units of the scene, of unknown size"
-    assert materials == [f"material {index}: endmember_{index}" for index in range(3)]
+    assert materials == [f"material {index}: {name}" for index, name in enumerate(SCENE.materials.names)]
     outwards = columns(ply, "xyz") - FRAME.to_world(np.zeros(3))
     radii = np.linalg.norm(outwards, axis=1, keepdims=True)
     np.testing.assert_allclose(radii, RADIUS / FRAME.scale, atol=0.02 / FRAME.scale)
@@ -175,7 +176,7 @@ def test_points_are_in_the_world_of_the_scene_with_unit_normals_out_of_the_surfa
 
 def test_each_point_has_material_abundances_and_the_colour_of_its_diffuse_spectrum(cloud):
     ply, _ = cloud
-    names = [f"abundance_endmember_{index}" for index in range(3)]
+    names = property_names(SCENE.materials.names)
     shares = columns(ply, names)
     assert shares.dtype == np.float32
     np.testing.assert_allclose(shares.sum(axis=1), 1, atol=1e-5)
@@ -205,7 +206,7 @@ def test_indices_targets_and_nearest_spectra_are_written_for_each_point(points, 
     found = columns(ply, written)
     assert found.dtype == np.float32
     assert found.shape == (count, 4)
-    shares = columns(ply, [f"abundance_endmember_{index}" for index in range(3)])
+    shares = columns(ply, property_names(SCENE.materials.names))
     seen = shares @ spectra
     np.testing.assert_allclose(found[:, 0], seen[:, 4] / seen[:, 1], rtol=1e-4)
     material = np.asarray(ply["vertex"]["material"])

@@ -48,7 +48,7 @@ def test_densities_are_per_world_unit_and_abundances_those_of_the_field(volume):
     clear = (places[:, 2].abs() > 1e-4).numpy()
     np.testing.assert_array_equal(found[clear], expected[clear])
     assert (volume["density"].dtype, volume["abundances"].dtype) == (np.float32, np.float32)
-    assert volume["endmember_names"].tolist() == ["endmember_0", "endmember_1", "endmember_2"]
+    assert volume["endmember_names"].tolist() == list(SCENE.materials.names)
     np.testing.assert_array_equal(volume["endmembers"], SCENE.materials.endmembers.numpy())
     np.testing.assert_array_equal(volume["wavelengths_nm"], SCENE.bands.centers_nm)
 

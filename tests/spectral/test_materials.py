@@ -1,5 +1,6 @@
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
@@ -9,7 +10,13 @@ from torch.testing import assert_close
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import rgb_matrix
-from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Coefficients, Materials, default_names
+from unmix_plugin.spectral.materials import (
+    OCCUPIED_ACCUMULATION,
+    Coefficients,
+    Materials,
+    default_names,
+    find_endmember,
+)
 
 PARTS = ("accumulation", "distance", "abundances", "scaled_abundances", "specular")
 counts = st.integers(0, 4)
@@ -59,11 +66,37 @@ def materials(endmembers: torch.Tensor, names: tuple[str, ...] = ()) -> Material
 
 
 def test_endmembers_are_numbered_unless_they_are_named_and_each_needs_a_name_of_its_own():
-    assert materials(torch.ones(2, 5)).names == default_names(2) == ("endmember_0", "endmember_1")
+    assert materials(torch.ones(2, 5)).names == default_names(2) == ("material 1", "material 2")
     assert materials(torch.ones(2, 5), ("clay", "leaf")).names == ("clay", "leaf")
     for names in (("clay",), ("clay", "clay"), ("clay", "leaf", "soil")):
         with pytest.raises(SpectrumError, match="2 endmembers need 2 distinct names; found"):
             materials(torch.ones(2, 5), names)
+
+
+def test_materials_are_called_by_their_colours_with_a_number_each_and_without_colours_by_number():
+    bands = Bands.of(np.linspace(400, 700, 31))
+    nm = bands.centers_nm
+    red, blue = (np.exp(-(((nm - centre) / 40) ** 2)) for centre in (650, 450))
+    spectra = torch.tensor(np.stack([red, np.full(31, 0.5), blue, 0.8 * red, np.full(31, 0.01)])).float()
+    named = Materials(bands, spectra, torch.zeros(0, 31)).called_by_colour()
+    assert named.names == ("red 1", "grey 1", "blue 1", "red 2", "black 1")
+    assert_close(named.endmembers, spectra)
+    infrared = Materials(Bands.of([1000.0, 1100.0, 1200.0]), spectra[:2, :3], torch.zeros(0, 3))
+    assert infrared.called_by_colour().names == ("material 1", "material 2")
+
+
+def test_an_endmember_is_found_by_its_name_its_number_and_the_name_of_earlier_releases():
+    names = ("tan 1", "3", "endmember_0", "green 1")
+    assert [find_endmember(asked, names) for asked in ("tan 1", "0", "endmember_1", "endmember 3")] == [
+        0,
+        0,
+        1,
+        3,
+    ]
+    assert find_endmember("3", names) == 1, "names come before numbers"
+    assert find_endmember("endmember_0", names) == 2
+    for asked in ("tan 2", "4", "endmember_4", "-1", "1.0", ""):
+        assert find_endmember(asked, names) is None
 
 
 def test_a_band_beyond_full_scale_counts_in_the_colour_with_all_that_it_has():

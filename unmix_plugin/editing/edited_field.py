@@ -34,7 +34,7 @@ from unmix_plugin.light.shading import Lamplight
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import rgb_matrix
 from unmix_plugin.spectral.colour.srgb import encode_srgb
-from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Coefficients, Materials
+from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Coefficients, Materials, find_endmember
 from unmix_plugin.trained.trained_scene import TrainedScene
 
 _NUM_VIEWS = 8
@@ -197,8 +197,8 @@ class MaterialState:
             raise ConfigError(f"there is no endmember {endmember}; the run has {self._listed()}")
         if self.names.count(endmember) > 1:
             raise ConfigError(f"two endmembers are called {endmember!r} here; say which by its number")
-        if endmember in self.names:
-            return self.names.index(endmember)
+        if (found := find_endmember(endmember, self.names)) is not None:
+            return found
         hint = did_you_mean(endmember, self.names, form="{} ")
         raise ConfigError(f"there is no endmember {endmember!r}; {hint}the run has {self._listed()}")
 

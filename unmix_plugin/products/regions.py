@@ -16,7 +16,7 @@ from unmix_plugin.products import scene_products
 from unmix_plugin.products.product import Job
 from unmix_plugin.products.scene_products import Regions
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
-from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION
+from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, find_endmember
 from unmix_plugin.trained.measured_surface import MeasuredRegion, MeasuredSurface
 from unmix_plugin.trained.measures import (
     Scale,
@@ -115,10 +115,9 @@ def _requested(job: Job, asked: Regions) -> Region:
         return Box((low[0], low[1], low[2]), (high[0], high[1], high[2]))
     if asked.material is not None:
         names = job.materials.names
-        if asked.material in names:
-            return OfMaterial(names.index(asked.material))
-        if asked.material.isdecimal() and int(asked.material) < len(names):
-            return OfMaterial(int(asked.material))
+        index = find_endmember(asked.material, names)
+        if index is not None:
+            return OfMaterial(index)
         raise ConfigError(f"no material {asked.material!r}; there are {', '.join(names)}, or numbers from 0")
     assert asked.view is not None
     camera = find_view(job.views("eval"), asked.view, job.views("train")).camera

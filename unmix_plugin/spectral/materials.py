@@ -9,6 +9,7 @@ any leading axes.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -20,6 +21,9 @@ from torch import Tensor
 
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.colour.conversion import colour_mode, rgb_matrix
+from unmix_plugin.spectral.colour.names import colour_words, numbered_words
+from unmix_plugin.spectral.colour.srgb import encode_srgb
 from unmix_plugin.spectral.library.material_library import DARK_LIGHT
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable
 from unmix_plugin.spectral.segmentation import material_ids, material_scores
@@ -131,12 +135,32 @@ SegmentationMethod = Literal["abundances", "probe"]
 
 
 def default_names(count: int) -> tuple[str, ...]:
-    """Names of endmembers without names of their own.
+    """Names of materials of which no colour is known.
 
     >>> default_names(2)
-    ('endmember_0', 'endmember_1')
+    ('material 1', 'material 2')
     """
-    return tuple(f"endmember_{index}" for index in range(count))
+    return numbered_words(["material"] * count)
+
+
+_BY_NUMBER = re.compile(r"(?:endmember[_ ])?(\d{1,9})")
+"""An endmember by its number, or by the name that it had in earlier releases."""
+
+
+def find_endmember(asked: str, names: Sequence[str]) -> int | None:
+    """The number of the endmember of a name, or whose number is asked for; None where there is none.
+
+    Args:
+        asked: A name, a number from 0 such as `1`, or `endmember_1`, as the second was called in earlier releases.
+
+    >>> names = ("tan 1", "green 1")
+    >>> [find_endmember(asked, names) for asked in ("green 1", "1", "endmember_0", "blue 1")]
+    [1, 1, 0, None]
+    """
+    if asked in names:
+        return names.index(asked)
+    by_number = _BY_NUMBER.fullmatch(asked)
+    return int(by_number[1]) if by_number and int(by_number[1]) < len(names) else None
 
 
 @dataclass(frozen=True)
@@ -151,7 +175,7 @@ class Materials:
     """How a ray's material is chosen: its largest abundance, or as published the endmember of smallest angle to the
     ray's spectrum."""
     names: tuple[str, ...] = ()
-    """One for each endmember, distinct. None given: `default_names`."""
+    """One for each endmember, distinct. None given: `default_names`; `called_by_colour` gives better ones."""
     light: Float[Tensor, "B"] | None = None
     """Relative power of the light that the spectra are seen in; None where it is unknown."""
     is_light_assumed: bool = False
@@ -188,6 +212,15 @@ class Materials:
         """Bands with light enough, `DARK_LIGHT`, to compare reflectances in; all where the light is unknown."""
         light = self.endmembers.new_ones(len(self.bands)) if self.light is None else self.light
         return light > DARK_LIGHT * light.max()
+
+    def called_by_colour(self) -> Materials:
+        """The same with names by which people tell them: the word for the colour that each has in the scene's light,
+        and a number; unchanged where the bands see no colours."""
+        if colour_mode(self.bands) != "true-colour":
+            return self
+        linear = self.endmembers.detach().cpu().double().clamp(min=0) @ rgb_matrix(self.bands, torch.float64)
+        srgb = encode_srgb(linear.clamp(0, 1).numpy())
+        return replace(self, names=numbered_words(colour_words(srgb)))
 
     def table(self) -> SpectraTable:
         """The endmembers with their names: spectra under the scene's light, [0, 1]."""

@@ -52,6 +52,7 @@ def unmix_scene(
             eval_cameras=own.corrected_lens(record.eval_cameras),
         )
     materials = replace(materials, endmembers=frozen[id(model.endmembers)], specular_spectra=specular)
+    materials = materials.called_by_colour()
     gains = copy.deepcopy(model.view_gains, frozen)  # type: ignore[arg-type]
     views = torch.arange(model.metadata["num_train_views"], device=model.device)
     return TrainedScene(

@@ -29,7 +29,7 @@ from unmix_plugin.spectral.colour.conversion import (
 )
 from unmix_plugin.spectral.features import FEWEST_BANDS, continuum_removed, derivative_matrix
 from unmix_plugin.spectral.intervals import COVERAGE
-from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Coefficients, Materials
+from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Coefficients, Materials, find_endmember
 from unmix_plugin.spectral.segmentation import NOTHING_ID, material_scores
 from unmix_plugin.spectral.subspace import PcaColours
 from unmix_plugin.trained.intervals import SeenPlaces, no_interval, reflectance_number
@@ -561,13 +561,13 @@ def _scored(view: MixtureView, score: Score) -> Tensor:
 def _endmember(name: str, materials: Materials) -> int:
     """Number of the endmember that an output such as `abundance:leaf` names."""
     argument = name.partition(":")[2]
-    number = int(argument) if argument.isdecimal() and argument not in materials.names else -1
-    if argument not in materials.names and not 0 <= number < len(materials.names):
+    index = find_endmember(argument, materials.names)
+    if index is None:
         hint = did_you_mean(argument, materials.names, likeness=0.5, form=" ({})")
         raise ConfigError(
             f"{name}: there is no endmember {argument!r}{hint}; known are {', '.join(materials.names)}"
         )
-    return materials.names.index(argument) if argument in materials.names else number
+    return index
 
 
 def _abundance(name: str, _: str, materials: Materials) -> MaterialOutput:

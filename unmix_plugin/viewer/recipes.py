@@ -25,6 +25,7 @@ from unmix_plugin.editing import (
     Swap,
 )
 from unmix_plugin.editing.recipe_files import MOST_EDITS
+from unmix_plugin.spectral.materials import find_endmember
 
 _ChangeT = TypeVar("_ChangeT", bound=Operation)
 
@@ -130,7 +131,8 @@ def numbered(recipe: Recipe, names: tuple[str, ...]) -> Recipe:
     present = list(names)
 
     def number_of(endmember: str | int) -> str | int:
-        return present.index(endmember) if endmember in present else endmember
+        found = find_endmember(endmember, present) if isinstance(endmember, str) else None
+        return endmember if found is None else found
 
     operations: list[Operation] = []
     for one in recipe.operations:

@@ -87,7 +87,7 @@ EXR_CHANNELS = {
     "accumulation": ["accumulation"],
     "band:550nm": ["band-550nm"],
     "normals": ["normals.X", "normals.Y", "normals.Z"],
-    "abundances": [f"abundances.endmember_{index}" for index in range(3)],
+    "abundances": [f"abundances.{name}" for name in SCENE.materials.names],
 }
 
 

@@ -151,7 +151,7 @@ def test_bands_and_shares_are_painted_by_their_value_between_the_ends_of_the_sca
     assert "550 nm" in legend.label
     picture, legend = painted(opaque, aids, "abundance", endmember=1, **grey)
     assert_close(picture[..., 1], opaque.coefficients.abundances[..., 1], atol=4e-3, rtol=0)
-    assert legend.label == "abundance of endmember_1"
+    assert legend.label == f"abundance of {opaque.materials.names[1]}"
     _, legend = painted(frame, aids, "false-colour", false_colour_nm=(649.0, 551.0, 449.0))
     assert legend == "red 650 nm, green 550 nm, blue 450 nm"
 

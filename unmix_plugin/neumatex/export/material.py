@@ -31,8 +31,8 @@ from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import rgb_matrix
 from unmix_plugin.spectral.colour.srgb import encode_srgb
-from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
-from unmix_plugin.spectral.materials import default_names
+from unmix_plugin.spectral.library.spectra_csv import write_spectra_csv
+from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.run_views import directions_to_world, gltf_positions, positions_for_files
 
 _TEXTURES = ("base_colour", "gltf_base_colour", "gltf_metallic_roughness")
@@ -160,15 +160,12 @@ def write_material(
     if isinstance(family, NeuralFamily):
         written += write_shader(folder, family)
     if isinstance(family, SpectralFamily) and bands is not None:
-        names, about = (
-            default_names(family.num_endmembers),
-            "shares of the endmembers of endmembers.csv; linear",
-        )
+        about = "shares of the endmembers of endmembers.csv; linear"
+        endmembers = family.endmembers.detach().cpu()
+        materials = Materials(bands, endmembers, endmembers[:0]).called_by_colour()
         shares, table = family.abundances(baked.parameters), folder / "endmembers.csv"
-        written.append(baked.write_channels(folder / "abundances.exr", shares, names, about))
-        write_spectra_csv(
-            table, SpectraTable(bands, names, family.endmembers.detach().cpu().double().numpy())
-        )
+        written.append(baked.write_channels(folder / "abundances.exr", shares, materials.names, about))
+        write_spectra_csv(table, materials.table())
         written.append(table)
     return written, error
 

@@ -81,6 +81,7 @@ def page_content(scene: ObjectForPage, resolution: int) -> PageContent:
         flat = torch.ones(len(scene.bands))
         none = torch.zeros(0, len(scene.bands))
         materials = Materials(scene.bands, family.endmembers.detach().cpu(), none, light=flat)
+        materials = materials.called_by_colour()
         arrays = {"scaled": shares.numpy(), "abundances": shares.numpy()}
         arrays["materials"] = shares.argmax(dim=1).numpy().astype(np.uint8)
         family = InColours(family, scene.bands)

@@ -32,8 +32,6 @@ from unmix_plugin.trained.measures import Scale, describe_area
 from unmix_plugin.trained.run_materials import endmember_colours, shown_matches
 
 SHOWN_VIEWS = 3
-NEAR_RAD = 0.1
-"""Spectral angle above which the nearest known material is no match."""
 _ERROR = Output("error", "map", "error", "root mean squared error over bands", (0.0, 0.1), "magma")
 ERROR_SCALE = scale_of(_ERROR)
 """Colours of errors of spectra."""
@@ -248,16 +246,21 @@ def material_cards(
     library: MaterialLibrary,
     truth: TrueMaterials | None,
 ) -> list[dict[str, Any]]:
-    """A card for each endmember; its `matches` are what it resembles: line, angle in radians, bands compared.
+    """A card for each endmember; its `matches` are what it is like: line, angle in radians, bands compared; where
+    nothing known is, `nearest` is what resembles it most: name, angle.
 
     `proportions` are parts of all that is seen; spectra are seen in `light`, None where it is unknown.
     """
     spectra, nm = materials.endmembers.detach().cpu().double().numpy(), materials.bands.centers_nm
     colours = endmember_colours(materials)
     matches: list[list[tuple[ChartLine, float, int]]] = []
+    nearest: list[tuple[str, float] | None] = []
     for found in shown_matches(spectra, materials.bands, light, library):
         matches.append([])
-        for shown, (dash, grey) in zip(found, _STYLES, strict=False):
+        alike = [shown for shown in found if shown.match.is_alike]
+        is_unlike_all = bool(found) and not alike
+        nearest.append((found[0].match.name, found[0].match.angle_rad) if is_unlike_all else None)
+        for shown, (dash, grey) in zip(alike, _STYLES, strict=False):
             line = ChartLine(nm, shown.spectrum, shown.match.name, grey, 1.5, dash)
             matches[-1].append((line, shown.match.angle_rad, shown.match.num_bands))
     if truth is not None:  # each as bright as the endmember that it is the partner of
@@ -272,7 +275,7 @@ def material_cards(
         own = ChartLine(nm, spectra[index], name, css_colour(colours[index]), 3.0)
         chart = SpectraChart([*(line for line, *_ in matches[index]), own], materials.quantity)
         seen = {"name": name, "colour": colours[index], "proportion": float(proportions[index])}
-        cards.append({**seen, "chart": chart, "matches": matches[index]})
+        cards.append({**seen, "chart": chart, "matches": matches[index], "nearest": nearest[index]})
     return cards
 
 

@@ -34,7 +34,6 @@ from unmix_plugin.products.regions import measure_regions, measured_surface
 from unmix_plugin.products.report import pictures
 from unmix_plugin.products.report.pictures import (
     ERROR_SCALE,
-    NEAR_RAD,
     ReportViews,
     TrueMaterials,
     evenly,
@@ -259,8 +258,8 @@ def _summary(
     """What was found and how sure, in two or three sentences."""
     named, ordered = [], sorted(cards, key=lambda card: -card["proportion"])
     for card in ordered[:_NAMED_MATERIALS]:
-        labels = [line.label for line, angle, _ in card["matches"] if angle <= NEAR_RAD]
-        near = [f", most like {label}" for label in labels if label in known_names]
+        labels = [line.label for line, *_ in card["matches"] if line.label in known_names]
+        near = [f", most like {label}" for label in labels]
         named.append(f"{card['name']} ({card['proportion']:.0%} of what is seen{''.join(near[:1])})")
     if len(ordered) > _NAMED_MATERIALS:
         named.append(f"and {len(ordered) - _NAMED_MATERIALS} more")

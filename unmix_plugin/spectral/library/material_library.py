@@ -78,6 +78,10 @@ class LibraryMaterial:
     """The file, and the spectrum's name in it; None for what comes with the program."""
 
 
+ALIKE_RAD = 0.1
+"""Spectral angle up to which two materials are alike."""
+
+
 @dataclass(frozen=True)
 class LibraryMatch:
     """A known material that resembles a spectrum."""
@@ -88,6 +92,11 @@ class LibraryMatch:
     num_bands: int
     """Bands that were compared."""
     source: str
+
+    @property
+    def is_alike(self) -> bool:
+        """Whether the spectrum may be of this material."""
+        return self.angle_rad <= ALIKE_RAD
 
 
 @dataclass(frozen=True)

@@ -46,9 +46,6 @@ from unmix_plugin.viewer.page import (
 from unmix_plugin.viewer.rendering.scene import Edit
 from unmix_plugin.viewer.session import Session
 
-_ALIKE_RAD = 0.1
-"""Spectral angle up to which two materials are alike."""
-
 
 def _matches(
     library: MaterialLibrary, spectra: Float[np.ndarray, "N B"], materials: Materials, count: int
@@ -63,7 +60,7 @@ def likeness_rows(
 ) -> list[tuple[str, str]]:
     """Rows of a table of the known materials, three at most, that a spectrum is like, and of where they are from."""
     (found,) = _matches(library, spectrum[None], materials, 3)
-    alike = [one for one in found if one.angle_rad <= _ALIKE_RAD]
+    alike = [one for one in found if one.is_alike]
     if not alike:
         nearest = f"; nearest is {found[0].name}, {found[0].angle_rad:.3f} rad" if found else ""
         return [("like", f"nothing that is known{nearest}")]
@@ -276,7 +273,7 @@ class MaterialsPanel:
         entries = []
         for index, found in enumerate(_matches(self._library, spectra[:_LONGEST_LIST], materials, 1)):
             hidden = "" if recipes.is_shown(self._recipe, index) else " (hidden)"
-            like = [one.name.rpartition("/")[2] for one in found if one.angle_rad <= _ALIKE_RAD]
+            like = [one.name.rpartition("/")[2] for one in found if one.is_alike]
             entries.append(
                 (
                     f"{materials.names[index]}{hidden}{''.join(f', like {one}' for one in like)}",
