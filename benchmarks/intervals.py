@@ -93,9 +93,13 @@ def main(options: Options) -> None:
                 flush=True,
             )
     setting = {
-        "max_seconds": None if options.runs else seconds,
+        "seconds of training": {
+            name: round(found["training"]["seconds"]) for name, found in measured.items()
+        },
         "device": options.device,
-        "options": "defaults, but --pipeline.model.num-endmembers = number of materials",
+        "options": "those of the runs given"
+        if options.runs
+        else "defaults, but --pipeline.model.num-endmembers = number of materials",
         "index": "normalised difference of the bands at a quarter and three quarters",
     }
     report = _common.Report(
