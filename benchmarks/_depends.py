@@ -61,6 +61,7 @@ DEPENDS_ON: dict[str, tuple[str, ...]] = {
     "spoilt_views": ("captures",),
     "store": ("scenes", "datamanager.py"),
     "subspace": ("spectral",),
+    "unexplained": ("trained", "spectral/unmixing"),
     "unmixing": ("spectral", "losses", "model.py", "field.py"),
     "unmixing_2d": ("spectral/unmixing",),
     "viewer": ("viewer", "trained", "rendering"),

@@ -19,8 +19,10 @@ from unmix_plugin.trained.model_scene import model_scene
 from unmix_plugin.trained.outputs import OUTPUTS, usual_range
 from unmix_plugin.trained.protocol import RenderableScene, RenderedView
 from unmix_plugin.trained.trained_scene import MaterialView
+from unmix_plugin.trained.unexplained_map import UnexplainedMap
 
-SCENE = make_scene(light=[0.5, 0.7, 1.0, 0.9, 0.6])
+EVERYWHERE = UnexplainedMap(np.full(3, -4.0), 8.0, np.zeros((1, 3), np.int64), np.full(1, 0.25, np.float32))
+SCENE = replace(make_scene(light=[0.5, 0.7, 1.0, 0.9, 0.6]), unexplained=EVERYWHERE)
 WITH_ARGUMENTS = (
     *("band:500nm", "false-colour:650,550,450", "index:r600/r500"),
     *("absorption:450-650", "absorption:area:450-650", "library:+builtin", "library:angle:+builtin"),
@@ -45,7 +47,8 @@ def test_an_output_has_the_shape_and_the_values_that_it_promises(view, name):
     assert (values.dtype == torch.uint8) == (output.kind == "labels")
     assert not values.requires_grad
     assert not values.isinf().any()
-    may_be_undefined = output.kind == "spectra" or name.startswith(("index:", "absorption:", "library:"))
+    undefined = ("index:", "absorption:", "library:", "unexplained")
+    may_be_undefined = output.kind == "spectra" or name.startswith(undefined)
     assert may_be_undefined or not values.isnan().any()
     low, high = output.value_range or (-torch.inf, torch.inf)
     known = values[~values.isnan()] if values.is_floating_point() else values

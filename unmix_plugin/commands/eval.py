@@ -163,6 +163,7 @@ def _report(console: Console, run: ComparedRun, found: Evaluated, is_edited: boo
     from rich.table import Table
 
     from unmix_plugin.trained.evaluation import DEFINITIONS
+    from unmix_plugin.trained.unexplained import describe_unexplained
     from unmix_plugin.trained.view_fit import describe_misfits, read_misfits
 
     for what, how in _ALIGNED.items():
@@ -186,7 +187,7 @@ def _report(console: Console, run: ComparedRun, found: Evaluated, is_edited: boo
     unknown = [name for name, value in figures.items() if value is None]
     if unknown:
         tell(f"not measured, since the scene does not have the truth for it: {', '.join(unknown)}")
-    for sentence in describe_misfits(read_misfits(run.path)):
+    for sentence in [*describe_misfits(read_misfits(run.path)), *describe_unexplained(run.path)]:
         tell(sentence)
     tell(f"{run.pictures / 'metrics.json'}  these figures, and those of each view")
     if found.num_pictures:

@@ -187,35 +187,45 @@ def finish(trainer: Trainer, console: Console) -> None:
     data = trainer.pipeline.datamanager
     scene = spectral_scene(data)
     if scene is not None:  # remarks name settings of spectral methods
-        _compare_views(trainer, scene, console, record.steps)
+        _judge_training_views(trainer, scene, console, record.steps)
         num_pixels = int(data.metadata().get("num_train_pixels", 0))
         few = remark_on_passes(record.total_rays, num_pixels)
         for remark in [*remarks_on_course(trainer.run.metrics_path), *few]:
             say(console, remark)
 
 
-def _compare_views(trainer: Trainer, scene: Scene, console: Console, steps: int) -> None:
-    """Say, here and in run.log, which training views do not fit the others, and keep how far the scene is off."""
+def _judge_training_views(trainer: Trainer, scene: Scene, console: Console, steps: int) -> None:
+    """Say, here and in run.log, which training views do not fit the others, and what the materials do not explain;
+    keep how far the scene is off."""
     from unmix_plugin.commands.reporting import say, working
     from unmix_plugin.engine.runs.load_run import read_scene_record
     from unmix_plugin.engine.training.progress import write_event
     from unmix_plugin.trained.measured_errors import measure_errors, write_errors
     from unmix_plugin.trained.open_run import mixture_scene
     from unmix_plugin.trained.places import MeasuredScene
-    from unmix_plugin.trained.view_fit import describe_misfits, fit_views, write_fits
+    from unmix_plugin.trained.training_views import thinned_views
+    from unmix_plugin.trained.unexplained import find_unexplained, write_unexplained
+    from unmix_plugin.trained.view_fit import describe_misfits, fit_of_view, write_fits
 
-    averages = None if trainer.average is None else trainer.average.values
+    averages, run = None if trainer.average is None else trainer.average.values, trainer.run
     with trainer.control.device.training_turn(), working(console, "comparing training views"):
-        record = read_scene_record(trainer.run)
+        record = read_scene_record(run)
         trained = mixture_scene(trainer.pipeline.model, trainer.config.method_name, record, averages)
         if trained is None:
             return
-        found = write_fits(trainer.run.path, fit_views(trained, scene))
+        views = list(thinned_views(trained, scene))
+        fits = [fit for fit in map(fit_of_view, views) if fit is not None]
+        misfits = write_fits(run.path, fits)
+        unexplained = find_unexplained(trained, [view for view in views if view.name not in misfits])
+        remarks = describe_misfits(misfits)
+        if unexplained is not None:
+            write_unexplained(run.path, unexplained, trained.materials)
+            remarks += unexplained.in_words(run.path)
         measured = MeasuredScene(scene, record.summary.get("illuminant"))
-        write_errors(trainer.run.path, measure_errors(trained, measured), steps)
-    for remark in describe_misfits(found):
+        write_errors(run.path, measure_errors(trained, measured), steps)
+    for remark in remarks:
         say(console, f"warning: {remark}")
-        write_event(trainer.run, remark)
+        write_event(run, remark)
 
 
 def _write_results(trainer: Trainer) -> None:

@@ -31,6 +31,7 @@ from unmix_plugin.trained.places import MeasuredScene
 from unmix_plugin.trained.protocol import RenderableScene
 from unmix_plugin.trained.run_views import recorded_views, world_frame
 from unmix_plugin.trained.trained_scene import TrainedScene, with_cells
+from unmix_plugin.trained.unexplained_map import read_unexplained_map
 
 
 def unmix_scene(
@@ -153,7 +154,8 @@ def load_run(path: str | Path, device: str = "auto") -> LoadedRun:
     shape = (len(scene.bands), len(scene.materials.names))
     errors = read_errors(loaded.run.path, loaded.training.steps, *shape)
     errors = errors if isinstance(errors, str) else errors.map(lambda values: values.to(scene.device))
-    return replace(run, scene=replace(scene, scale=run.scale, measured_errors=errors))
+    known = {"measured_errors": errors, "unexplained": read_unexplained_map(loaded.run.path)}
+    return replace(run, scene=replace(scene, scale=run.scale, **known))
 
 
 def open_run(path: str | Path, device: str = "auto") -> TrainedScene:

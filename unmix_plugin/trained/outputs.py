@@ -80,6 +80,11 @@ class MixtureView(ABC):
 
     @property
     @abstractmethod
+    def unexplained(self) -> Tensor:
+        """Part of what was measured that no mixture of the materials gives, [0, 1]; NaN where that is unknown."""
+
+    @property
+    @abstractmethod
     def has_removed(self) -> bool:
         """Whether the scene is shown without some of its materials."""
 
@@ -93,8 +98,8 @@ class MixtureView(ABC):
         """The same view with its coefficients on another device, or of some rows."""
 
 
-Capability: TypeAlias = Literal["light"]
-"""What a scene may lack that an output needs: a known light."""
+Capability: TypeAlias = Literal["light", "training views"]
+"""What a scene may lack that an output needs: a known light, a comparison with what its training views measured."""
 
 
 _Compute: TypeAlias = Callable[[MixtureView], Tensor]
@@ -400,6 +405,16 @@ def _table() -> tuple[MaterialOutput, ...]:
             _UNIT,
             remarks=("as published",),
             compute=lambda view: torch.softmax(_scores(view), dim=-1),
+        ),
+        row(
+            "unexplained",
+            "map",
+            "what no material explains",
+            "part of the measured spectrum that no mixture of the materials gives",
+            colour_map="magma",
+            needs=frozenset({"training views"}),
+            remarks=(_NOTHING_IS_NAN,),
+            compute=lambda view: view.unexplained,
         ),
         row(
             "pca",

@@ -42,6 +42,7 @@ from unmix_plugin.trained.outputs import (
 from unmix_plugin.trained.place_errors import LocalErrors, PlaceErrors
 from unmix_plugin.trained.protocol import Probe, RenderedView, seen_place
 from unmix_plugin.trained.run_views import RunView, cameras_of
+from unmix_plugin.trained.unexplained_map import UnexplainedMap
 
 
 def one_pixel(camera: Cameras, column: int, row: int) -> Cameras:
@@ -106,6 +107,15 @@ class MaterialView(MixtureView):
         normals = scene.renderer.normals(scene.field, rays, seen.ray_distance.flatten())
         turned = normals @ torch.as_tensor(scene.frame.rotation, dtype=normals.dtype).to(normals)
         return turned.view(*seen.accumulation.shape, 3) * seen.is_occupied[..., None]
+
+    @property
+    def unexplained(self) -> Float[Tensor, "H W"]:
+        """Part of what was measured there that no mixture of the materials gives, [0, 1]; NaN where that is unknown."""
+        scene, seen = self.scene, self.coefficients
+        assert scene.unexplained is not None, "of such a scene the output is refused"
+        rays = self.camera.to(seen.packed.device).image_rays(0)
+        ends = rays.origins + seen.ray_distance.reshape(-1, 1) * rays.directions
+        return scene.unexplained.at(ends).view_as(self.opacity).where(seen.is_occupied, torch.nan)
 
     @property
     def has_removed(self) -> bool:
@@ -196,6 +206,8 @@ class TrainedScene:
     """What is rendered, times this, is as bright as each training view measured it; on the CPU. None: 1."""
     measured_errors: PlaceErrors | str = "errors are measured when a training ends"
     """How far it was from what its training views measured, as it was trained; or why that is unknown, for people."""
+    unexplained: UnexplainedMap | None = None
+    """Where no mixture of its materials gives what the training views measured; None where that is not known."""
 
     @property
     def errors(self) -> PlaceErrors | str:
@@ -245,7 +257,10 @@ class TrainedScene:
     @property
     def outputs(self) -> tuple[MaterialOutput, ...]:
         """All outputs that take no argument, but those that its bands or its light don't allow."""
-        return available_outputs(self.materials)
+        found = available_outputs(self.materials)
+        return tuple(
+            one for one in found if self.unexplained is not None or "training views" not in one.needs
+        )
 
     @property
     def lit_head_on(self) -> TrainedScene:
@@ -259,6 +274,11 @@ class TrainedScene:
         found = find_output(name, self.materials)
         if name.startswith("interval:"):
             _ = self.known_errors
+        if "training views" in found.needs and self.unexplained is None:
+            raise ConfigError(
+                f"the output {name} needs what the training views measured, which is compared when a training ends; "
+                "train the run to its end, or go on with a larger --max-num-iterations"
+            )
         return found
 
     def look(self, camera: Cameras, subpixels: int | None = None) -> MaterialView:

@@ -16,19 +16,13 @@ from enum import Enum, unique
 from pathlib import Path
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float64
 
 from unmix_plugin.engine.runs.atomic_files import read_run_json, write_run_json
-from unmix_plugin.rendering.front_to_back import composite
-from unmix_plugin.scenes.scene import Scene
-from unmix_plugin.trained.run_views import RunView, views_of
-from unmix_plugin.trained.trained_scene import TrainedScene
+from unmix_plugin.trained.training_views import ThinnedView
 
 FILE_NAME = "training_views.json"
 """In the folder of a run."""
-_LONGEST_SIDE_PX = 64
-"""Of what is rendered of a view."""
 _FEWEST_VIEWS, _FEWEST_PIXELS = 6, 50
 _TIMES_USUAL, _LEAST_ERROR = 2.0, 0.05
 """Error of a view over the median of all from which it stands out, if it is so much of its brightness at all."""
@@ -75,52 +69,25 @@ class ViewFit:
     """Share of the pixels whose error is at least half of the root mean square."""
 
 
-@torch.no_grad()
-def fit_views(trained: TrainedScene, scene: Scene) -> list[ViewFit]:
-    """Compare the training views with all bands with what is rendered of them; reads their cubes."""
-    found = []
-    for row, (index, view) in enumerate(
-        zip(scene.train_indices, views_of(trained.views, "train"), strict=True)
-    ):
-        if scene.sensor_of(index).sees_all_bands:
-            gains = None if trained.view_gains is None else trained.view_gains[row].double().numpy()
-            fit = _fit(trained, scene, index, view, gains)
-            found += [] if fit is None else [fit]
-    return found
-
-
-def _fit(
-    trained: TrainedScene, scene: Scene, index: int, view: RunView, gains: Float64[np.ndarray, " B"] | None
-) -> ViewFit | None:
-    stride = -(-max(view.camera.size(0)) // _LONGEST_SIDE_PX)
-    every = slice(stride // 2, None, stride)
-    measured = scene.cube(index, (every, every)).astype(np.float64)
-    height, width = measured.shape[:2]
-    counts = scene.valid_mask(index, (every, every))
-    alpha = scene.alpha(index)
-    counts = counts if alpha is None else counts & (alpha[every, every] > 0.5)
+def fit_of_view(view: ThinnedView) -> ViewFit | None:
+    """Compare a training view with what is rendered of it; None where it is dark or too few pixels count."""
+    counts = view.counts
     if counts.sum() < _FEWEST_PIXELS:
         return None
-    rows, columns = np.mgrid[:height, :width] * stride + stride // 2 + 0.5
-    coords = torch.from_numpy(np.stack([columns.ravel(), rows.ravel()], axis=1)).float()
-    rays = view.camera.generate_rays(torch.zeros(len(coords), dtype=torch.int64), coords)
-    seen = composite(trained.renderer, trained.field, rays.to(trained.device))
-    rendered = trained.materials.spectra(seen).cpu().double().numpy().reshape(measured.shape)
-    rendered = rendered if gains is None else rendered * gains
-    scale = float(np.sqrt(np.mean(measured[counts] ** 2)))
+    measured, rendered = view.measured[counts], view.rendered[counts]
+    scale = float(np.sqrt(np.mean(measured**2)))
     if not scale > 0:
         return None
-    own, other = measured[counts], rendered[counts]
-    factor = float((own * other).sum() / max(float((other**2).sum()), 1e-12))
-    away = np.sqrt(np.mean((own - other) ** 2, axis=1)) / scale
+    factor = float((measured * rendered).sum() / max(float((rendered**2).sum()), 1e-12))
+    away = np.sqrt(np.mean((measured - rendered) ** 2, axis=1)) / scale
     error = float(np.sqrt(np.mean(away**2)))
-    grey, shown = measured.mean(axis=2), rendered.mean(axis=2)
+    grey, shown = view.measured.mean(axis=2), view.rendered.mean(axis=2)
     contrast = [_fine_contrast(picture, counts) for picture in (grey, shown)]
     return ViewFit(
         name=view.name,
         error=error,
         factor=factor,
-        error_of_factor=float(np.sqrt(np.mean((own - factor * other) ** 2))) / scale,
+        error_of_factor=float(np.sqrt(np.mean((measured - factor * rendered) ** 2))) / scale,
         error_of_shift=error * left_by_best_shift(grey, shown, counts),
         sharpness=contrast[0] / max(contrast[1], 1e-12),
         spread=float((away > 0.5 * error).mean()),

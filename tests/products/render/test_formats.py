@@ -21,7 +21,10 @@ def formats(*outputs, asked=(), is_path=False):
 
 
 def test_all_is_every_output_that_the_model_has_and_each_has_formats_that_suit_it():
-    assert set(formats("all")) == set(OUTPUTS) - {"reflectance"}  # the light is unknown
+    assert set(formats("all")) == set(OUTPUTS) - {
+        "reflectance",
+        "unexplained",
+    }  # without a light and what was measured
     assert formats("spectral", "rgb", "abundances", "segmentation", "depth", "linear_rgb", "band:550nm") == {
         "spectral": ["envi"],
         "rgb": ["png"],

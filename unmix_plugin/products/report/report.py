@@ -51,6 +51,7 @@ from unmix_plugin.trained.measures import describe_length
 from unmix_plugin.trained.open_run import LoadedRun
 from unmix_plugin.trained.run_materials import LIGHT_UNKNOWN
 from unmix_plugin.trained.run_views import RunView, world_frame
+from unmix_plugin.trained.unexplained import describe_unexplained
 from unmix_plugin.trained.view_fit import describe_misfits, read_misfits
 
 _VIEWS_WITH_SHARES, _WORST_VIEWS = 2, 3
@@ -75,7 +76,10 @@ def export(job: Job, asked: Report) -> list[Path]:
     views = _look(job, chosen, scene)
     if len(chosen) < len(job.loaded.record.eval_cameras):
         notes.append(f"Rendered: {len(chosen)} of {len(job.loaded.record.eval_cameras)} evaluation views.")
-    notes += [f"{sentence}." for sentence in describe_misfits(read_misfits(job.loaded.folder.path))]
+    run = job.loaded.folder.path
+    notes += [
+        f"{sentence}." for sentence in [*describe_misfits(read_misfits(run)), *describe_unexplained(run)]
+    ]
     regions, kept = [], job.loaded.measures.regions
     if kept:
         found, failed = measure_regions(measured_surface(job), kept)
