@@ -3,7 +3,8 @@
     python benchmarks/unexplained.py [--scenes 10 --steps 600]
 
 Renders tables of objects whose materials are drawn, with a flat patch of 0.5 to 3 % of the surface on each: of a
-material that is nowhere else, in every other scene a metamer of what it lies on (the same colour, another spectrum).
+material that is nowhere else, in every other scene a metamer of what it lies on (the same chromaticity, 0.7 times as
+bright, another spectrum).
 Each is trained with as many endmembers as there are other materials. A patch is found where the run names one whose
 middle is within a patch's radius, and a pixel, of the true one; all others are false. Each scene is trained without its
 patch as well, where nothing is to be named. About 15 minutes on two quiet cores.
@@ -84,16 +85,18 @@ def draw(seed: int) -> Planted:
     """A scene by its number."""
     generator = np.random.default_rng(100 + seed)
     known = MATERIALS[:-1]
-    things = []
-    for thing in THINGS:
+    things, is_metamer = [], seed % 2 == 1
+    for number, thing in enumerate(THINGS):
         first, second = generator.choice(known, 2, replace=False)
+        if is_metamer and number == 0:  # a dark colour has no room for metamers that differ
+            first, second = "white", second if second != "white" else first
         things.append(replace(thing, surface=replace(thing.surface, first=str(first), second=str(second))))
     surface = float(np.linspace(0.005, 0.03, 10)[seed % 10])
     radius = float(np.sqrt(surface * _SURFACE / np.pi))
     angle = generator.uniform(-0.7, 0.1)
     away = 1.2 - radius  # between the objects and the rim
     middle = (away * np.cos(angle), away * np.sin(angle), _TOP)
-    return Planted(tuple(things), seed % 2 == 1, surface, middle, radius)
+    return Planted(tuple(things), is_metamer, surface, middle, radius)
 
 
 def spectra_with(planted: Planted, wavelengths_nm: np.ndarray) -> np.ndarray:
@@ -101,7 +104,10 @@ def spectra_with(planted: Planted, wavelengths_nm: np.ndarray) -> np.ndarray:
     eye sees under the lamp."""
     spectra = reflectances(wavelengths_nm)
     if planted.is_metamer:
-        bands, base = Bands.of(wavelengths_nm), spectra[MATERIALS.index(planted.things[0].surface.first)]
+        bands, base = (
+            Bands.of(wavelengths_nm),
+            0.7 * spectra[MATERIALS.index(planted.things[0].surface.first)],
+        )
         seen = rgb_matrix(bands).double().numpy() * lamp_power(wavelengths_nm)[:, None]
         unseen = linalg.null_space(seen.T)
         black = unseen @ (unseen.T @ np.sin(np.linspace(0.0, 5 * np.pi, len(base))))

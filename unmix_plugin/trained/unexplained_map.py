@@ -55,7 +55,7 @@ class UnexplainedMap:
         place = points.detach().cpu().double().numpy()
         index = np.floor((place - self.origin) / self.edge).astype(np.int64) + 1
         inside = ((index >= 0) & (index < smooth.shape)).all(axis=-1)
-        index = np.where(inside[..., None], index, 0)
+        index = np.where(np.expand_dims(inside, -1), index, 0)
         found = np.where(inside, smooth[tuple(np.moveaxis(index, -1, 0))], np.nan)
         return torch.from_numpy(found.astype(np.float32)).to(points.device)
 

@@ -57,7 +57,7 @@ def gathered(offsets, with_truth=True, materials=MATERIALS) -> Any:
 
 NOTHING: dict[str, Any] = dict.fromkeys(("page", "light_unknown", "figures"))
 NOTHING |= dict.fromkeys(("num_known", "num_main"), 0)
-NOTHING |= {key: [] for key in ("cards", "regions", "unknown", "versions")}
+NOTHING |= {key: [] for key in ("cards", "regions", "unexplained", "unknown", "versions")}
 NOTHING |= {"figures_source": "", "summary": "", "about": "", "quantity": "radiance", "settings": "{}"}
 TEXTS = {"title": "Title <x>", "subtitle": "run", "notes": ["so & so"], "facts": [("<b>", "</dl>")]}
 

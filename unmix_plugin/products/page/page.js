@@ -42,7 +42,7 @@
       return how.is_root ? scale * value * value : scale * value;
     });
   };
-  const [positions, materials, confidence] = ["positions", "materials", "confidence"].map(read);
+  const [positions, materials, confidence, unexplained] = ["positions", "materials", "confidence", "unexplained"].map(read);
   const [areas, keptShares] = ["areas", "regions"].map(read);
   const [scaled, abundances, gloss, tints] = ["scaled", "abundances", "gloss", "tints"].map(read);
   // Of objects whose light can be exchanged: `relit` says how the rest is meant.
@@ -245,7 +245,7 @@
   const layers = [
     ["colour", relit ? "colour in a light" : facts.colour.startsWith("true") ? "true colour" : "false colour of all bands"], ...(relit ? [["base", "base colour"], ["roughness", "roughness"], ["metallicity", "metallicity"]] : []),
     ...(B ? [["band", "one band"], ["false", "false colour"], ["abundance", "abundance of a material"], ["materials", "materials"]] : []),
-    ...(confidence ? [["confidence", "confidence in the material"]] : []), ...(B ? [["index", "spectral index"]] : []),
+    ...(confidence ? [["confidence", "confidence in the material"]] : []), ...(unexplained ? [["unexplained", "what no material explains"]] : []), ...(B ? [["index", "spectral index"]] : []),
   ];
   const litLayers = relit ? ["colour"] : ["colour", "band", "false"];
   layers.forEach(([value, text]) => $("layer").append(make("option", { value, text })));
@@ -350,6 +350,10 @@
       return "the material of each place, and the area of the surface that it covers";
     },
     confidence: () => { paintValues((v) => confidence[v], 0, 1); return "estimated probability that the material is right"; },
+    unexplained: () => {
+      paintValues((v) => unexplained[v], 0, 0.2);
+      return "part of the measured spectrum that no mixture of the materials gives, 0 to 0.2 and more; 0 where too few views see";
+    },
     index: () => {
       const known = facts.indices[state.index];
       const text = state.formula || known?.formula || "";

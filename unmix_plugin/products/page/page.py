@@ -322,6 +322,8 @@ def _vertex_arrays(
         "materials": scene.materials.to("cpu").ids(found).numpy(),
         "confidence": scene.materials.to("cpu").confidence(found).numpy(),
     }
+    if scene.unexplained is not None:
+        arrays["unexplained"] = scene.unexplained.at(positions).nan_to_num(0.0).numpy()
     if len(scene.materials.specular_spectra):
         arrays["gloss"] = torch.linalg.solve(squares, products[..., None])[..., 0].numpy()
         arrays["tints"] = (tints / tints.sum(dim=1, keepdim=True).clamp(min=1e-9)).numpy()

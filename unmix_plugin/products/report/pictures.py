@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float64, UInt8
 
 from unmix_plugin.engine.outputs import Output
-from unmix_plugin.figures.paint import as_bytes, paint, scale_of
+from unmix_plugin.figures.paint import ColourScale, as_bytes, paint, scale_of
 from unmix_plugin.figures.plotting import RIGHT, WRONG, ChartLine, Colour, SpectraChart, css_colour
 from unmix_plugin.formats.files import eight_bits
 from unmix_plugin.products.evaluation import material_look
@@ -29,12 +29,17 @@ from unmix_plugin.spectral.segmentation import NOTHING_ID
 from unmix_plugin.trained.evaluation import Evaluation, PredictedView, ViewTruth, as_numpy, picture
 from unmix_plugin.trained.measured_surface import MeasuredRegion
 from unmix_plugin.trained.measures import Scale, describe_area
+from unmix_plugin.trained.outputs import picture_values
 from unmix_plugin.trained.run_materials import endmember_colours, shown_matches
+from unmix_plugin.trained.run_views import RunView
+from unmix_plugin.trained.trained_scene import TrainedScene
 
 SHOWN_VIEWS = 3
 _ERROR = Output("error", "map", "error", "root mean squared error over bands", (0.0, 0.1), "magma")
 ERROR_SCALE = scale_of(_ERROR)
 """Colours of errors of spectra."""
+_UNEXPLAINED_RANGE = (0.0, 0.2)
+"""What pictures show of the part that no material explains."""
 _MAP_COLUMNS = (7, 6, 5)
 _STYLES = (("dashed", "#4b545c"), ("dotted", "#7a838b"), ("solid", "#a2aab1"))
 _EightBits = UInt8[np.ndarray, "H W 3"]
@@ -161,6 +166,21 @@ def colour_pictures(views: Sequence[_ShownView]) -> list[_CaptionedPicture]:
             _CaptionedPicture(view.error, f"error, PSNR {view.psnr_db:.1f} dB", f"{view.name}, error"),
         ]
     return pictures
+
+
+def unexplained_pictures(
+    scene: TrainedScene, views: Sequence[RunView]
+) -> tuple[list[_CaptionedPicture], ColourScale] | None:
+    """Where no mixture of the materials gives what was measured, in a few views; None where that is not known."""
+    if scene.unexplained is None:
+        return None
+    output, pictures = scene.output("unexplained"), []
+    for view in evenly(views, SHOWN_VIEWS):
+        values = picture_values(scene.look(view.camera), output)
+        painted = paint(output, values.values, values.opacity, _UNEXPLAINED_RANGE)
+        image = as_bytes(painted.over()[:, :, 0])
+        pictures.append(_CaptionedPicture(image, view.name, f"{view.name}, {output.title}"))
+    return pictures, scale_of(output, _UNEXPLAINED_RANGE)
 
 
 def share_pictures(views: ReportViews) -> list[tuple[str, list[_CaptionedPicture]]]:

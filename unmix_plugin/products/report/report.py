@@ -80,6 +80,8 @@ def export(job: Job, asked: Report) -> list[Path]:
     notes += [
         f"{sentence}." for sentence in [*describe_misfits(read_misfits(run)), *describe_unexplained(run)]
     ]
+    with job.working("looking for what no material explains"):
+        unexplained = pictures.unexplained_pictures(job.scene, chosen)
     regions, kept = [], job.loaded.measures.regions
     if kept:
         found, failed = measure_regions(measured_surface(job), kept)
@@ -88,6 +90,8 @@ def export(job: Job, asked: Report) -> list[Path]:
         regions = [pictures.region_card(name, one, job.materials, scale) for name, one in found.items()]
     with job.working("laying out the report"):
         values = {**_page(job, views, known, about), "notes": notes, "regions": regions}
+        values["unexplained"], scale = unexplained or ([], None)
+        values["unexplained_scale"] = None if scale is None else (scale, scale_strip(scale, 220, 12))
         page = _render_page(values).encode("utf-8", "backslashreplace")
         return [write_file(job.folder / "report.html", page)]
 
