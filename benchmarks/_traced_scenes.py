@@ -224,7 +224,7 @@ def _room() -> TracedScene:
 
 def _pots() -> TracedScene:
     wavelengths = np.linspace(400, 1000, 61)
-    names = ("leaf", "dry leaf", "soil", "clay", "grey plastic", "blue plastic")
+    names = ("leaf", "dry leaf", "soil", "clay", "grey plastic", "paint")
     spectra = np.concatenate([
         _modelled(21, wavelengths, "plant", "dry plant", "soil", "tile", "asphalt"),
         _modelled(7, wavelengths, "paint"),
@@ -271,7 +271,7 @@ def _withered(start: Sequence[float], reach: float, healthy: float) -> Callable[
 
 
 def _turntable() -> TracedScene:
-    names = ("leaf", "dry leaf", "soil", "ceramic", "card", "blue plastic")
+    names = ("leaf", "dry leaf", "soil", "ceramic", "card", "paint")
     spectra = np.concatenate([
         _modelled(31, INFRARED, "plant", "dry plant", "soil", "concrete", "mineral"),
         _modelled(9, INFRARED, "paint"),

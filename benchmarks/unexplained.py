@@ -27,7 +27,15 @@ import tyro
 from scipy import linalg
 
 from unmix_plugin.scenes.demo import scene as demo
-from unmix_plugin.scenes.demo.shading import MATERIALS, THINGS, Surface, Thing, lamp_power, reflectances
+from unmix_plugin.scenes.demo.shading import (
+    MATERIALS,
+    THINGS,
+    Surface,
+    Thing,
+    lamp_power,
+    plain,
+    reflectances,
+)
 from unmix_plugin.scenes.demo.shapes import PlacedPrimitive
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import rgb_matrix
@@ -78,7 +86,7 @@ class Planted:
         """The patch itself."""
         hidden = MATERIALS[-1]
         lens = PlacedPrimitive("cylinder", (*self.middle[:2], 0.0), (self.radius, self.radius, _TOP))
-        return Thing(lens, Surface(hidden, hidden, lambda points: np.zeros(len(points), dtype=points.dtype)))
+        return Thing(lens, Surface(hidden, hidden, plain))
 
 
 def draw(seed: int) -> Planted:
@@ -135,7 +143,9 @@ def train(planted: Planted, has_patch: bool, folder: Path, options: Options) -> 
 
 
 def _num_known(planted: Planted) -> int:
-    return len({name for thing in planted.things for name in (thing.surface.first, thing.surface.second)})
+    """Materials that are to be seen beside the patch."""
+    surfaces = [thing.surface for thing in planted.things]
+    return len({one.first for one in surfaces} | {one.second for one in surfaces if one.blend is not plain})
 
 
 def main(options: Options) -> None:

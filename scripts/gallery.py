@@ -26,7 +26,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 from PIL import Image
-from scipy.optimize import linear_sum_assignment
 
 from unmix_plugin import Cameras, Light, MaterialView, Recipe, TrainedScene, edit_scene, open_run, train
 from unmix_plugin.commands.export import export
@@ -88,11 +87,11 @@ class Studio:
             _, power = _table(self.data(name) / "illuminant.csv")
             found = scene.materials.endmembers.double().cpu().numpy()
             cosine = _unit(found) @ _unit(truth * power).T
-            rows, columns = linear_sum_assignment(-cosine)
-            names = [
-                Rename(int(row), true_names[column].replace("_", " "))
-                for row, column in zip(rows, columns, strict=True)
-            ]
+            nearest = [true_names[column].replace("_", " ") for column in cosine.argmax(axis=1)]
+            names = []
+            for row, name in enumerate(nearest):  # two endmembers may be one material in truth
+                count = nearest[: row + 1].count(name)
+                names.append(Rename(row, name if count == 1 else f"{name} {count}"))
             self._opened[name] = edit_scene(scene, Recipe(tuple(names)))
             lines = [f"  - rename: {{endmember: {edit.endmember}, name: {edit.name}}}" for edit in names]
             (self.work / f"{name}.yml").write_text("\n".join(["edits:", *lines, ""]))
@@ -262,7 +261,7 @@ def make_materials(studio: Studio) -> None:
     """What a scene is made of: its materials, their spectra, and where each is."""
     scene = studio.scene("table")
     colours, names = endmember_colours(scene.materials), scene.materials.names
-    view = look(scene, evaluation(scene, 2), 400, 330, 1.1)
+    view = look(scene, evaluation(scene, 6), 400, 330, 1.1)
     figure = plt.figure(figsize=(11, 5.6), facecolor="white")
     for left, picture, title in (
         (0.0, colour(view), "the scene from a new viewpoint"),
@@ -301,8 +300,8 @@ def make_plant(studio: Studio) -> None:
     row = [
         ("true colour", colour(view)),
         ("infrared shown as red", infrared(view)),
-        ("NDVI: blue plastic fools it", index(view, NDVI)),
-        ("materials: told apart", materials(view, colours)),
+        ("NDVI", index(view, NDVI)),
+        ("materials", materials(view, colours)),
     ]
     panels(PICTURES / "plant.png", [row], list(zip(scene.materials.names, colours, strict=True)))
 
@@ -319,7 +318,7 @@ def make_lights(studio: Studio) -> None:
         ("HP1", "sodium lamp (HP1)"),
     ):
         lit = edit_scene(scene, Recipe(illuminant=Light(name)))
-        row.append((title, colour(look(lit, camera, 360, 300, 1.1))))
+        row.append((title, colour(look(lit, camera, 360, 300, 0.95))))
     panels(PICTURES / "lights.png", [row])
 
 
@@ -330,11 +329,11 @@ def make_edits(studio: Studio) -> None:
     recipes: list[tuple[str, tuple[Operation, ...]]] = [
         ("as it was taken", ()),
         ("blue recoloured", (Retint("blue flower", (0.85, 0.55, 0.1)),)),
-        ("red replaced", (Replace("red", "checker/foliage"),)),
+        ("red replaced", (Replace("red", "ColorChecker/foliage"),)),
         ("white removed", (Remove(("white card",)),)),
     ]
     row = [
-        (title, colour(look(edit_scene(scene, Recipe(edits)), camera, 360, 300, 1.1)))
+        (title, colour(look(edit_scene(scene, Recipe(edits)), camera, 360, 300, 0.95)))
         for title, edits in recipes
     ]
     panels(PICTURES / "edits.png", [row])
