@@ -89,9 +89,9 @@ class Studio:
             cosine = _unit(found) @ _unit(truth * power).T
             nearest = [true_names[column].replace("_", " ") for column in cosine.argmax(axis=1)]
             names = []
-            for row, name in enumerate(nearest):  # two endmembers may be one material in truth
-                count = nearest[: row + 1].count(name)
-                names.append(Rename(row, name if count == 1 else f"{name} {count}"))
+            for row, material in enumerate(nearest):  # two endmembers may be one material in truth
+                count = nearest[: row + 1].count(material)
+                names.append(Rename(row, material if count == 1 else f"{material} {count}"))
             self._opened[name] = edit_scene(scene, Recipe(tuple(names)))
             lines = [f"  - rename: {{endmember: {edit.endmember}, name: {edit.name}}}" for edit in names]
             (self.work / f"{name}.yml").write_text("\n".join(["edits:", *lines, ""]))
@@ -372,7 +372,7 @@ def make_page(studio: Studio) -> None:
         page.goto((folder / "page.html").resolve().as_uri())
         page.wait_for_function("window.unmixPage")
         page.wait_for_timeout(3000)
-        for x, y in ((375, 320), (430, 490), (330, 590)):
+        for x, y in ((375, 320), (430, 490)):
             page.mouse.click(x, y)
             page.wait_for_timeout(1500)
         page.screenshot(path=str(PICTURES / "page.png"))
