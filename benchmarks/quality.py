@@ -234,7 +234,9 @@ def _span(values: list[float]) -> str:
     return f"{min(values):.2f}-{max(values):.2f}"
 
 
-def _number(value: float | None) -> str:
+def _number(value: float | list[str] | None) -> str:
+    if isinstance(value, list):  # what was aligned before views were compared
+        return ", ".join(value)
     return "" if value is None else f"{value:.4g}"
 
 
