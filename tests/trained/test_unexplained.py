@@ -11,9 +11,11 @@ import torch
 from tests.method_factory import CAMERA, NUM_BANDS, make_scene
 from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.spectral.library.spectra_csv import read_spectra
+from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.trained.training_views import ThinnedView
 from unmix_plugin.trained.unexplained import (
     SPECTRA_NAME,
+    Unexplained,
     find_unexplained,
     read_unexplained,
     write_unexplained,
@@ -46,6 +48,13 @@ def floor_views(retouch: np.ndarray | None = None, count: int = 5, noise: float 
     return views
 
 
+def found_in(views: list[ThinnedView], scene: TrainedScene = SCENE) -> Unexplained:
+    """What is found where there is something to judge."""
+    found = find_unexplained(scene, views)
+    assert found is not None
+    return found
+
+
 def odd_spectrum() -> np.ndarray:
     """A spectrum that no mixture of the scene's endmembers comes near."""
     endmembers = SCENE.materials.endmembers.double().numpy()
@@ -55,8 +64,7 @@ def odd_spectrum() -> np.ndarray:
 
 
 def test_a_retouch_is_one_patch_where_it_is_with_the_spectrum_that_was_measured():
-    found = find_unexplained(SCENE, floor_views(odd_spectrum()))
-    assert found is not None
+    found = found_in(floor_views(odd_spectrum()))
     [patch] = found.patches
     middle = SCENE.frame.to_model(patch.position[None])[0]
     np.testing.assert_allclose(middle, [5 * EDGE - 0.3, 4 * EDGE - 0.3, 0], atol=1.5 * EDGE)
@@ -71,10 +79,10 @@ def test_a_retouch_is_one_patch_where_it_is_with_the_spectrum_that_was_measured(
 
 
 def test_mixtures_noise_and_shade_are_no_patches():
-    assert find_unexplained(SCENE, floor_views()).patches == ()
-    assert find_unexplained(SCENE, floor_views(noise=0.05)).patches == ()
+    assert found_in(floor_views()).patches == ()
+    assert found_in(floor_views(noise=0.05)).patches == ()
     mixture = 0.3 * SCENE.materials.endmembers[:2].double().numpy().sum(axis=0)
-    assert find_unexplained(SCENE, floor_views(mixture)).patches == ()
+    assert found_in(floor_views(mixture)).patches == ()
 
 
 def test_what_fewer_than_three_views_see_is_not_judged():
@@ -86,16 +94,18 @@ def test_materials_that_explain_nothing_well_are_said_to_be_too_few(tmp_path):
     one = replace(
         SCENE, materials=replace(SCENE.materials, endmembers=SCENE.materials.endmembers[:1], names=("a",))
     )
-    found = find_unexplained(one, floor_views())
+    found = found_in(floor_views(), one)
     [sentence] = found.in_words(tmp_path)
     assert "more than --endmembers 1" in sentence
 
 
 def test_what_a_run_keeps_is_read_again_and_offers_the_patch_as_a_material(tmp_path):
-    found = find_unexplained(SCENE, floor_views(odd_spectrum()))
+    found = found_in(floor_views(odd_spectrum()))
     assert read_unexplained(tmp_path) is None
     write_unexplained(tmp_path, found, SCENE.materials)
     again = read_unexplained(tmp_path)
+    assert again is not None
+    assert SCENE.materials.light is not None
     assert again.in_words(tmp_path) == found.in_words(tmp_path)
     np.testing.assert_array_equal(again.map.cells, found.map.cells)
     table = read_spectra(tmp_path / SPECTRA_NAME)
