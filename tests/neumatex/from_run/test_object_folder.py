@@ -25,6 +25,8 @@ from unmix_plugin.neumatex.fit.data_manager import ObjectDataManagerConfig
 from unmix_plugin.neumatex.fit.object_scene import LIGHT_UNKNOWN, load_object
 from unmix_plugin.neumatex.fit.settings import NeumatexModelConfig
 from unmix_plugin.neumatex.from_run.object_folder import ObjectRecipe, object_of_run
+from unmix_plugin.scenes.reading.loader import load_scene
+from unmix_plugin.trained.open_run import open_run
 
 WORDS = ["--endmembers", 2, "--device", "cpu", "--poses", "fixed", "--max-num-iterations", 60]
 
@@ -64,6 +66,22 @@ def test_the_object_of_a_run_is_a_folder_that_neumatex_reads(ball):
 
 def load_cube(scene, index):
     return np.load(scene / "cubes" / f"{index:03d}.npy")
+
+
+def test_exposures_that_training_found_are_undone_in_its_views(ball, tmp_path):
+    words = ["--data", ball[0], "--output-dir", tmp_path, *WORDS, "--light", "per-view"]
+    run, said = run_of(done(train, "unmix-nerf", *words)), list[str]()
+    folder = object_of_run(ObjectRecipe(run, 300), said.append)
+    assert any("exposures that training found are undone" in line for line in said)
+    scene, gains = load_scene(ball[0]), open_run(run).view_gains
+    assert gains is not None
+    assert not np.allclose(gains, 1)
+    for row, index in enumerate(scene.train_indices[:2]):
+        written = np.load(folder / "cubes" / f"{scene.frames[index].name}.npy")
+        assert np.allclose(written, scene.cube(index) / gains[row].numpy(), rtol=1e-5)
+    kept = scene.eval_indices[0]
+    written = np.load(folder / "cubes" / f"{scene.frames[kept].name}.npy")
+    assert np.allclose(written, scene.cube(kept), rtol=1e-5)
 
 
 def test_a_run_alone_is_enough_to_train(ball, tmp_path):

@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float64
 from PIL import Image
 
 from unmix_plugin.engine import Decision
@@ -131,7 +132,7 @@ def _write_object(folder: Path, recipe: ObjectRecipe, loaded: LoadedRun, say: Sa
         )
     if recipe.environment is None:
         _refuse_moving_lamp(recipe, loaded)
-    content = _write_pictures(folder, recipe, loaded, scene)
+    content = _write_pictures(folder, recipe, loaded, scene, say)
     decisions = list[Decision]()
     if recipe.mesh is None:
         decisions.append(_write_mesh(folder, recipe, loaded, say))
@@ -142,13 +143,27 @@ def _write_object(folder: Path, recipe: ObjectRecipe, loaded: LoadedRun, say: Sa
     write_file(folder / DECISIONS_FILE, json.dumps([each.to_json() for each in decisions], indent=1).encode())
 
 
-def _write_pictures(folder: Path, recipe: ObjectRecipe, loaded: LoadedRun, scene: Scene) -> dict[str, Any]:
+def _write_pictures(
+    folder: Path, recipe: ObjectRecipe, loaded: LoadedRun, scene: Scene, say: Say
+) -> dict[str, Any]:
     """Cubes, pictures, masks, truth and other lights of a scene; the content of transforms.json but for what else is
     known."""
     trained, bands = loaded.materials_scene, Bands(scene.wavelengths_nm)
     views = {view.name: view for view in trained.views}
     shown = [index for index, frame in enumerate(scene.frames) if frame.name in views]
-    frames = [_write_frame(folder, scene, index) for index in shown]
+    is_linked, gains = _is_clean(scene), dict[int, np.ndarray]()
+    if trained.view_gains is not None:
+        gains, is_linked = (
+            dict(zip(scene.train_indices, trained.view_gains.double().numpy(), strict=True)),
+            False,
+        )
+        say(
+            "exposures that training found are undone in its views; views that are kept apart stay as they are"
+        )
+    frames = [
+        _write_frame(folder, scene, index, None if is_linked else gains.get(index, np.ones(1)))
+        for index in shown
+    ]
     splits: dict[str, list[str]] = {"train": [], "eval": []}
     for index, frame in zip(shown, frames, strict=True):
         view = views[scene.frames[index].name]
@@ -158,7 +173,7 @@ def _write_pictures(folder: Path, recipe: ObjectRecipe, loaded: LoadedRun, scene
     content: dict[str, Any] = {"camera_model": "OPENCV", "tone_mapping": "linear"}
     content |= {"train_filenames": splits["train"], "val_filenames": splits["eval"]}
     content["wavelengths"] = scene.wavelengths_nm.tolist()
-    if _is_clean(scene) and scene.options.value_scale is not None:
+    if is_linked and scene.options.value_scale is not None:
         content["value_scale"] = scene.options.value_scale
     lamp = scene.illuminant if recipe.lamp is None else read_lamp(recipe.lamp, bands)
     if lamp is not None:
@@ -181,8 +196,11 @@ def _is_clean(scene: Scene) -> bool:
     return scene.options.invalid_pixels == "refuse"
 
 
-def _write_frame(folder: Path, scene: Scene, index: int) -> dict[str, Any]:
-    """The files of a view, each in a folder of its kind; gives their keys."""
+def _write_frame(
+    folder: Path, scene: Scene, index: int, gain: Float64[np.ndarray, " #B"] | None
+) -> dict[str, Any]:
+    """The files of a view, each in a folder of its kind; gives their keys. Cubes are links without a gain, or else
+    written again, divided by it."""
     frame, entry = scene.frames[index], dict[str, Any]()
     files = {
         "file_path": ("images", frame.image_path),
@@ -190,12 +208,14 @@ def _write_frame(folder: Path, scene: Scene, index: int) -> dict[str, Any]:
         "mask_path": ("masks", frame.mask_path),
         "abundance_file_path": ("abundances", frame.abundance_path),
     }
+    cube, mask = (folder / place / frame.name for place in ("cubes", "masks"))
+    if gain is not None:
+        np.save(make_folder(cube.parent) / f"{cube.name}.npy", (scene.cube(index) / gain).astype(np.float32))
+        entry["hyperspectral_file_path"] = f"cubes/{cube.name}.npy"
     if not _is_clean(scene):
-        cube, mask = (folder / place / frame.name for place in ("cubes", "masks"))
-        np.save(make_folder(cube.parent) / f"{cube.name}.npy", scene.cube(index))
         valid = Image.fromarray(scene.valid_mask(index).astype(np.uint8) * 255)
         valid.save(make_folder(mask.parent) / f"{mask.name}.png")
-        entry = {"hyperspectral_file_path": f"cubes/{cube.name}.npy", "mask_path": f"masks/{mask.name}.png"}
+        entry["mask_path"] = f"masks/{mask.name}.png"
     for key, (place, path) in files.items():
         if path is not None and key not in entry:
             entry[key] = f"{place}/{frame.name}{path.suffix}"
