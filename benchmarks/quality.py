@@ -1,12 +1,12 @@
-"""How well are unseen views predicted, and materials found, after three minutes of training?
+"""How well are unseen views predicted, and materials found, after about three minutes of training?
 
-    python benchmarks/quality.py [--scenes DIR] [--max-seconds 180 | --steps 4000]
+    python benchmarks/quality.py [--scenes DIR] [--steps 3000 | --max-seconds 180]
 
 Trains and evaluates each scene below DIR by the commands that a user would give, with the defaults of everything but
 the number of endmembers. Beside the segmentation are two methods that see single images only, scored by the same
 code on the true pixels of the evaluation views: k-means on spectra of equal length, and VCA with the nearest endmember
-by angle, their spectra found in the training views. Takes four minutes a scene. Where other programs share the machine,
-give steps: a step is the same everywhere, a second is not.
+by angle, their spectra found in the training views. Takes four minutes a scene. A step is the same everywhere; a second
+is not, where other programs share the machine.
 """
 
 from __future__ import annotations
@@ -65,10 +65,10 @@ class Options:
     only: tuple[str, ...] = ()
     """Names of the scenes to run; all if none is given. The others keep their earlier results, if they have the same
     setting."""
-    max_seconds: float = 180.0
-    """Seconds of training a scene."""
-    steps: int | None = None
-    """Steps of training a scene, in place of seconds."""
+    steps: int = 3000
+    """Steps of training a scene."""
+    max_seconds: float | None = None
+    """Seconds of training a scene, in place of steps."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where to train."""
     runs: Path | None = None
@@ -84,9 +84,7 @@ def main(options: Options) -> None:
     folders = _common.scene_folders(options.scenes, options.only)
     machine = _machine.describe_machine(options.device)
     seconds = 3.0 if options.quick else options.max_seconds
-    limit: dict[str, float] = {"max_seconds": seconds}
-    if options.steps is not None and not options.quick:
-        limit = {"steps": options.steps}
+    limit: dict[str, float] = {"steps": options.steps} if seconds is None else {"max_seconds": seconds}
     setting = {
         **limit,
         "device": options.device,

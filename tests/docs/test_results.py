@@ -31,7 +31,6 @@ TO_MEASURE_AGAIN = {
     "found_poses": "python benchmarks/found_poses.py --folder DIR",
     "gpu": "python benchmarks/gpu.py",
     "neumatex_prior": "python benchmarks/neumatex_prior.py",
-    "quality": "python benchmarks/quality.py",
 }
 """Results that are not clean, each with the command that measures it again. No other may join them."""
 
