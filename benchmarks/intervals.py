@@ -129,7 +129,7 @@ def measure(run: Path, device: str) -> tuple[str, dict[str, Any]]:
     scene, trained = find_scene(loaded.record.summary, run, None), loaded.materials_scene
     if scene is None or scene.endmembers is None:
         raise SystemExit(f"{run}: its scene is not where it was, or has no true endmembers")
-    _ = trained.known_errors  # which says why there are none
+    _ = trained.require_errors()  # which says why there are none
     views = [of_view(trained, scene, index) for index in scene.eval_indices]
     joined = {key: np.concatenate([view[key] for view in views]) for key in views[0]}
     return scene.root.name, {**scores(joined, scene), **times(trained), "training": training_share(run)}

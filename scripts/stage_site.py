@@ -32,6 +32,7 @@ COMMANDS = {
     "unmix-eval": ("eval", "evaluate", ("",)),
     "unmix-render": ("render", "render", ("",)),
     "unmix-export": ("export", "export", ("",)),
+    "unmix-asset": ("asset", "asset", ("",)),
     "unmix-compare": ("compare", "compare", ("",)),
     "unmix-view": ("view", "view", ("",)),
     "unmix-image": ("image", "image", ("",)),

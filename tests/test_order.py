@@ -42,6 +42,7 @@ TAKES_THE_ORDER = {
 }
 ALLOWED = {
     "captures/layouts/cubes.py": "ListComp",  # sorted at the end
+    "captures/poses/lines.py": "pop",  # of one
     "captures/poses/realitycapture.py": "pop",  # of one
     "commands/demo_scene.py": "list",  # whether there are any
     "commands/image.py": "Call",  # each is removed

@@ -140,7 +140,10 @@ def test_every_product_comes_from_the_run_folder_alone(solid, solid_copy, tmp_pa
     finally:
         shutil.move(tmp_path / "elsewhere", solid.scene)
     with (solid_copy / "exports/spectrum/eval_002_x8_y8.csv").open() as file:
-        assert next(csv.reader(file)) == ["wavelength", "predicted", "diffuse", "specular"]
+        heads = next(csv.reader(file))
+    assert [head for head in heads if not head.endswith(("_low", "_high"))] == [
+        *("wavelength", "predicted", "diffuse", "specular")
+    ]
     page = (solid_copy / "exports/report/report.html").read_text()
     assert "Not evaluated: run unmix-eval" in page
     assert_self_contained(page)
@@ -355,7 +358,7 @@ def test_a_point_goes_by_its_coordinates(solid, tmp_path):
     point = ["--point", "-0.0,0.05,0.2", "--run", solid.run, "--output", tmp_path, "--device", "cpu"]
     done(export, "spectrum", *point)
     with (tmp_path / "point_0_0.05_0.2.csv").open() as file:
-        assert next(csv.reader(file)) == ["wavelength", "predicted"]
+        assert next(csv.reader(file))[:2] == ["wavelength", "predicted"]
 
 
 def test_own_reflectances_are_compared_with_too(solid, tmp_path):
@@ -380,7 +383,7 @@ def test_a_report_with_the_find_scene_compares_and_is_self_contained(exported):
         r"Rendered: 1 of 2 evaluation views\.",
         r"Of the 1 views rendered for this report\.",
         "intersection over union",
-        r"6 materials told apart in 6 views: endmember_\d \(\d+% of what is seen",
+        r"6 materials told apart in 6 views: [a-z ]+ \d \(\d+% of what is seen",
         r"estimated probability of \d+% on average",
         "num_endmembers",
     ):

@@ -19,8 +19,8 @@ PAGES = [
     "CHANGELOG.md",
     *(path.relative_to(ROOT).as_posix() for path in sorted((ROOT / "docs").rglob("*.md"))),
 ]
-ELSEWHERE = ("unmix-view", "unmix-compare")
-"""Commands that are not run here: one never ends, the other needs two captures whose surfaces are trained well."""
+ELSEWHERE = ("unmix-view", "unmix-compare", "unmix-asset")
+"""Commands that are not run here: one never ends, others need captures whose surfaces are trained well."""
 RUN = "outputs/my-scene/unmix-nerf/2026-01-31_120000"
 """The run that README opens from Python."""
 SHORTER = {

@@ -93,14 +93,15 @@ def test_the_files_of_probes_hold_every_number(taken):
     rows = list(csv.reader(io.StringIO(_abundances_csv([taken, measured]).decode())))
     assert rows[0][:7] == ["probe", "x", "y", "z", "metres_per_unit", "material", "measured_in"]
     assert rows[0][7:9] == ["quantity", "light"]
-    assert rows[0][9:] == list(taken.materials.names)
+    names = taken.materials.names
+    assert rows[0][9:] == [f"{name}{end}" for name in names for end in ("", "_low", "_high")]
     assert [rows[2][4], *rows[2][6:9]] == ["", "train_003", "reflectance", "A"]
     assert rows[1][7:9] == ["radiance", ""]
-    np.testing.assert_allclose([float(value) for value in rows[1][9:]], taken.found.abundances, atol=1e-5)
+    np.testing.assert_allclose([float(value) for value in rows[1][9::3]], taken.found.abundances, atol=1e-5)
     np.testing.assert_allclose([float(value) for value in rows[1][1:4]], taken.world, rtol=1e-7)
     renamed = replace(taken, materials=replace(odd, names=("e", "new", "a,b")))
     rows = list(csv.reader(io.StringIO(_abundances_csv([taken, renamed]).decode())))
-    assert rows[0][9:] == ["a,b", 'c"d', "e", "new"]
-    assert rows[2][9:] == [rows[1][11], "", rows[1][9], rows[1][10]]
+    assert rows[0][9::3] == ["a,b", 'c"d', "e", "new"]
+    assert rows[2][9::3] == [rows[1][15], "", rows[1][9], rows[1][12]]
     rows = list(csv.reader(io.StringIO(_abundances_csv([taken], Scale(0.25, "known")).decode())))
     assert rows[1][4] == "0.25"

@@ -125,7 +125,7 @@ class MaterialView(MixtureView):
     @property
     def seen_places(self) -> SeenPlaces:
         """What is seen in each pixel, and how far it is expected to be off; a ConfigError where that is unknown."""
-        errors, seen = self.scene.known_errors, self.coefficients
+        errors, seen = self.scene.require_errors(), self.coefficients
         rays = self.camera.to(errors.origin.device).image_rays(0)
         positions = rays.origins + seen.ray_distance.flatten()[:, None].to(rays.origins) * rays.directions
         local = errors.at(positions.view(*self.opacity.shape, 3)).to(self.opacity.device)
@@ -216,8 +216,7 @@ class TrainedScene:
             return "the scene is edited, and errors are known of it only as it was trained"
         return self.measured_errors
 
-    @property
-    def known_errors(self) -> PlaceErrors:
+    def require_errors(self) -> PlaceErrors:
         """The same; a ConfigError where it is unknown."""
         errors = self.errors
         if isinstance(errors, str):
@@ -273,7 +272,7 @@ class TrainedScene:
         ConfigError where intervals are asked for and not determined."""
         found = find_output(name, self.materials)
         if name.startswith("interval:"):
-            _ = self.known_errors
+            _ = self.require_errors()
         if "training views" in found.needs and self.unexplained is None:
             raise ConfigError(
                 f"the output {name} needs what the training views measured, which is compared when a training ends; "

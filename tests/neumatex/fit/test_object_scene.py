@@ -17,7 +17,7 @@ from tests.neumatex.factory import CENTRE, COLOUR, ENDMEMBERS, LAMP, RADIUS, SIZ
 from tests.neumatex.surfaces import TURN, mesh_from
 from unmix_plugin.errors import UnmixError
 from unmix_plugin.formats.exr import write_exr, write_spectral_exr
-from unmix_plugin.neumatex.fit.data_manager import ObjectDataManager, ObjectDataManagerConfig, _PixelList
+from unmix_plugin.neumatex.fit.data_manager import ObjectDataManager, ObjectDataManagerConfig, PixelList
 from unmix_plugin.neumatex.fit.object_scene import load_object
 from unmix_plugin.neumatex.fit.pictures import read_picture
 from unmix_plugin.neumatex.tracing.rays import RayMesh
@@ -398,7 +398,7 @@ def test_pixels_that_a_mask_leaves_out_are_not_trained_on(made_spectral, spectra
     mask[:, :half] = 0
     Image.fromarray(mask).save(spectral_folder / "mask.png")
     _change_frames(spectral_folder, scene.split.train[0], mask_path="mask.png")
-    pixels, all_pixels = (_PixelList(one, 10**6, 0) for one in (load_object(spectral_folder), scene))
+    pixels, all_pixels = (PixelList(one, 10**6, 0) for one in (load_object(spectral_folder), scene))
     masked = (all_pixels.views == 0) & (all_pixels.corners[:, 0] < half)
     assert masked.any()
     assert len(pixels.views) == int((~masked).sum())

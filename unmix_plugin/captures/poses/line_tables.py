@@ -213,7 +213,7 @@ class _Read:
         for line, own in rows:
             where, numbers = f"{path}, line {line}", {}
             own_cells = dict(zip(names, own, strict=False))
-            for name in factors.keys() & {name for name, cell in own_cells.items() if cell}:
+            for name in (name for name in factors if own_cells.get(name)):
                 value = dialect.number(own_cells[name])
                 if value is None or not math.isfinite(value):
                     faults.append(f"{where}: {name} is {own_cells[name]!r}; expected a number")

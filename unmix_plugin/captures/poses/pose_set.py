@@ -11,19 +11,20 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 from xml.etree import ElementTree
 
 import numpy as np
-import torch
 from jaxtyping import Float64, UInt8
 
 from unmix_plugin.captures.poses.lens import Lens, require_possible
-from unmix_plugin.engine.geometry.key_poses import KeyPoses
 from unmix_plugin.errors import CaptureError, counted, name_some
 from unmix_plugin.formats.json_values import UnreadableJsonError, read_json_file
 from unmix_plugin.limits import MOST_TABLE_BYTES, parse_xml, read_bounded
 from unmix_plugin.scenes.placement import Placement
+
+if TYPE_CHECKING:
+    from unmix_plugin.engine.geometry.key_poses import KeyPoses
 
 FLIP = np.diag([1.0, -1.0, -1.0])
 """From OpenGL to OpenCV camera axes and back, from the right."""
@@ -59,6 +60,10 @@ class PosedCamera:
     @property
     def key_poses(self) -> KeyPoses:
         """Poses of lines at their heights in the image, as line cameras have them."""
+        import torch  # late: help of commands needs none of it
+
+        from unmix_plugin.engine.geometry.key_poses import KeyPoses
+
         poses = torch.from_numpy(self.camera_to_world[None] if self.lines is None else self.lines)
         return KeyPoses(poses, torch.arange(len(poses), dtype=poses.dtype) + 0.5, (len(poses),))
 
