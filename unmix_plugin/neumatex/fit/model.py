@@ -100,6 +100,7 @@ class NeumatexModel(Model):
             from unmix_plugin.neumatex.prior.small import predict
 
             assert self.config.material != "spectral"  # which has no prior
+            assert self.config.material != "auto"  # settled when training starts
             found = predict(
                 views_of(initial_data),
                 self.traced.ray_mesh,
