@@ -240,7 +240,7 @@ def state_linear(
     named, found, has_gains = plain_names(entries), [], False
     for fields in format_of.value:
         pair = fields.gains, fields.offsets
-        keys = [next((key for name, key in named.items() if name in names), "") for names in pair]
+        keys = [next((named[name] for name in names if name in named), "") for names in pair]
         gains, offsets = (_floats(path, f"{where} '{key}'", entries.get(key, "")) for key in keys)
         may_divide = keys[0] != _CF_FACTOR and named_by(keys[0]) in fields.divide_above_one and not keys[1]
         if may_divide and len(gains) == 1 and gains[0] > 1:
@@ -248,8 +248,8 @@ def state_linear(
         if len(gains) == 1 and not offsets and named.get("gain") == keys[0]:
             continue
         used = tuple(key for key, column in zip(keys, (gains, offsets), strict=True) if column)
-        names = {named_by(key) for key in used}
-        meaning = next((means for name, means in _MEANINGS.items() if name in names), Meaning.FRACTION)
+        used_names = {named_by(key) for key in used}
+        meaning = next((means for name, means in _MEANINGS.items() if name in used_names), Meaning.FRACTION)
         linear = linear_values(
             path,
             num_bands,
