@@ -144,8 +144,9 @@ def unmix_image(
     amounts = nnls(pixels, compared)
     order = _shares(amounts).sum(dim=0).argsort(descending=True)
     own = _shares(amounts[:, order])
-    certain = _confidence(pixels, own, found, compared, order)
-    deviation = _deviation(pixels, own, found, compared, order)
+    of_margins, of_sets = _spread_over_sets(pixels, own, found, compared, order)
+    certain = _confidence(own, of_margins)
+    deviation = _deviation(pixels, own, compared[order], pixels - amounts @ compared, of_sets)
     is_lit = amounts.sum(dim=1) > 0
     misfit = torch.where(is_lit, spectral_angle(pixels, amounts @ compared), 0.0)
     return UnmixedImage(
@@ -214,51 +215,55 @@ def _shares(amounts: Float[Tensor, "N K"]) -> Float[Tensor, "N K"]:
     return amounts / amounts.sum(dim=1, keepdim=True).clamp(min=1e-12)
 
 
-def _confidence(
+def _spread_over_sets(
     pixels: Float[Tensor, "N B"],
     own: Float[Tensor, "N K"],
     found: PooledEndmembers,
     compared: Float[Tensor, "K B"],
     order: Tensor,
-) -> Float[Tensor, "N"]:
+) -> tuple[Float[Tensor, "N"], Float[Tensor, "N K"]]:
+    """Mean squares by which the margin of the largest share, and all shares, differ with the other best sets of
+    endmembers; 0 of a single material."""
+    of_margins, of_sets = torch.zeros(len(own)), torch.zeros_like(own)
+    if own.shape[1] == 1:
+        return of_margins, of_sets
+    largest = own.topk(2, dim=1)
+    margins = largest.values[:, 0] - largest.values[:, 1]
+    for other in found.others:
+        shares = _shares(nnls(pixels, other * compared.norm(dim=1, keepdim=True)))[:, order]
+        first, second = shares.gather(1, largest.indices).unbind(1)
+        of_margins += (margins - first + second).square() / len(found.others)
+        of_sets += (shares - own).square() / len(found.others)
+    return of_margins, of_sets
+
+
+def _confidence(own: Float[Tensor, "N K"], of_margins: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
     """Probability that the largest share is the largest in truth: of its margin, if the spread of the margin over the
     best sets of endmembers is the margin's error."""
     if own.shape[1] == 1:  # nothing is second, and no search can tell whether a material is missing
         return torch.special.ndtr(torch.ones(len(own)) / _SHARED_MARGIN_ERROR)
-    largest = own.topk(2, dim=1)
-    margins = largest.values[:, 0] - largest.values[:, 1]
-    squares = torch.zeros_like(margins)
-    for other in found.others:
-        shares = _shares(nnls(pixels, other * compared.norm(dim=1, keepdim=True)))[:, order]
-        first, second = shares.gather(1, largest.indices).unbind(1)
-        squares += (margins - first + second).square()
-    error = (squares / len(found.others) + _SHARED_MARGIN_ERROR**2).sqrt()
-    return torch.special.ndtr(margins / error)
+    largest = own.topk(2, dim=1).values
+    error = (of_margins + _SHARED_MARGIN_ERROR**2).sqrt()
+    return torch.special.ndtr((largest[:, 0] - largest[:, 1]) / error)
 
 
 def _deviation(
     pixels: Float[Tensor, "N B"],
     own: Float[Tensor, "N K"],
-    found: PooledEndmembers,
-    compared: Float[Tensor, "K B"],
-    order: Tensor,
+    ordered: Float[Tensor, "K B"],
+    misfits: Float[Tensor, "N B"],
+    of_sets: Float[Tensor, "N K"],
 ) -> Float[Tensor, "N K"]:
     """Expected errors of shares: what the misfits of pixels become through the unmixing, how far the best sets of
     endmembers differ, and what all sets get wrong alike."""
     if own.shape[1] == 1:
         return torch.zeros_like(own)
-    ordered = compared[order]
-    misfits = pixels - nnls(pixels, ordered) @ ordered
     eigen = torch.linalg.eigh((misfits.T @ misfits).double() / len(misfits))
     kept = slice(-min(_DIRECTIONS, misfits.shape[1]), None)
     directions = (eigen.eigenvectors[:, kept] * eigen.eigenvalues[kept].clamp(min=0).sqrt()).T.to(pixels)
     sizes = misfits.square().mean(dim=1).sqrt()
     scales = (sizes / sizes.square().mean().sqrt().clamp(min=1e-12)).clamp(min=_LEAST_SCALE)
     own_errors = propagated_deviation(lambda one: _shares(nnls(one, ordered)), pixels, directions, scales)
-    of_sets = torch.zeros_like(own)
-    for other in found.others:
-        shares = _shares(nnls(pixels, other * compared.norm(dim=1, keepdim=True)))[:, order]
-        of_sets += (shares - own).square() / len(found.others)
     known = own_errors.square() + of_sets
     alike = known.mean() * (_ALIKE + _ALIKE_IN_MIXTURES * own * (1 - own))
     return (known + alike + _LEAST_ERROR**2).sqrt()
