@@ -69,8 +69,8 @@ def closed_surface(
 
     cameras = [view.camera for view in views_of(scene.views, "all")]
     seen = SeenSurface(scene, _NUM_RAYS, cameras, follow)
-    edge = float((scene.scene_box.aabb[1] - scene.scene_box.aabb[0]).max())
-    cells = int(np.clip(round(_CELLS_A_PIXEL * edge / scene.pixel_size), *_CELLS))
+    cells_across = _CELLS_A_PIXEL * float(scene.scene_box.size.max()) / scene.pixel_size
+    cells = int(np.clip(round(cells_across), *_CELLS))
     grid = GridPoints.over(scene.scene_box.aabb, cells)
     coarse = GridPoints.over(scene.scene_box.aabb, max(8, cells // _COARSER))
     first = np.stack([_distances(seen, coarse.slice_points(index)) for index in range(coarse.shape[0])])

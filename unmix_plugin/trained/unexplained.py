@@ -27,6 +27,7 @@ from jaxtyping import Bool, Float64, Int64
 from scipy import ndimage
 
 from unmix_plugin.engine.runs.atomic_files import read_run_json, write_run_json
+from unmix_plugin.engine.sampling import robust_deviation
 from unmix_plugin.errors import RunError
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 from unmix_plugin.spectral.materials import Materials
@@ -146,7 +147,7 @@ def find_unexplained(trained: TrainedScene, views: Iterable[ThinnedView]) -> Une
     part = np.sqrt(np.maximum(squares - variance[usable], 0)) / length[usable]
 
     median = float(np.median(part))
-    deviation = 1.4826 * float(np.median(np.abs(part - median)))
+    deviation = float(robust_deviation(part))
     stands_out = part > max(_LEAST_PART, median + _DEVIATIONS * deviation)
     stands_out &= squares > _LEAST_SIGNIFICANCE**2 * variance[usable]
     known, rows = cells[usable], np.flatnonzero(usable)
