@@ -23,7 +23,7 @@ def _products() -> Sequence[Any]:
 
 def _complete(config: TrainerConfig) -> TrainerConfig:
     """See `completed`; imported when a training starts."""
-    from unmix_plugin.neumatex.from_run.completing import completed
+    from unmix_plugin.neumatex.from_run.object_folder import completed
 
     return completed(config)
 

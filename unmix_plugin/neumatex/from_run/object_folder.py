@@ -14,6 +14,7 @@ import hashlib
 import json
 import os
 import shutil
+import sys
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -25,13 +26,14 @@ import torch
 from jaxtyping import Float64
 from PIL import Image
 
-from unmix_plugin.engine import Decision
+from unmix_plugin.engine import Decision, TrainerConfig
 from unmix_plugin.errors import ConfigError, SceneError
 from unmix_plugin.formats.exr import write_spectral_exr
 from unmix_plugin.formats.files import make_folder, safe_name, write_file
 from unmix_plugin.formats.meshes import write_ply
-from unmix_plugin.neumatex.fit.data_manager import PixelList
+from unmix_plugin.neumatex.fit.data_manager import ObjectDataManagerConfig, PixelList
 from unmix_plugin.neumatex.fit.object_scene import DECISIONS_FILE, LIGHT_UNKNOWN, load_posed_object
+from unmix_plugin.neumatex.fit.settings import NeumatexModelConfig
 from unmix_plugin.neumatex.fit.start import RunMaterials
 from unmix_plugin.neumatex.from_run.light import LitPoints, find_light
 from unmix_plugin.neumatex.tracing.light_files import ENVIRONMENT_SUFFIXES, read_lamp
@@ -326,3 +328,24 @@ def _copied_environment(folder: Path, scene: Scene) -> Mapping[str, Any]:
         "environment_exposure_stops": keys.environment_exposure_stops,
     }
     return {"environment_path": name, **{key: value for key, value in placement.items() if value is not None}}
+
+
+def completed(config: TrainerConfig) -> TrainerConfig:
+    """Settings with the object's folder as data, which is made of --from-run where no data is given; files that they
+    name are found from any working directory then. Errors are those of `object_of_run`."""
+    model, data = config.pipeline.model, config.pipeline.datamanager
+    if not isinstance(model, NeumatexModelConfig) or not isinstance(data, ObjectDataManagerConfig):
+        return config  # of a method that took ours for its own
+    run, mesh, environment = (
+        None if path is None else path.resolve() for path in (model.from_run, data.mesh, data.environment)
+    )
+    pipeline = replace(
+        config.pipeline,
+        model=replace(model, from_run=run),
+        datamanager=replace(data, mesh=mesh, environment=environment),
+    )
+    config = replace(config, pipeline=pipeline)
+    if config.data is not None or run is None:
+        return config
+    recipe = ObjectRecipe(run, data.mesh_triangles, mesh, environment, data.lamp)
+    return replace(config, data=object_of_run(recipe, lambda line: sys.stderr.write(f"{line}\n")))
