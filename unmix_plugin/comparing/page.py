@@ -5,7 +5,6 @@ It holds all that it shows, and asks for nothing.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from typing import Any
 
@@ -38,15 +37,8 @@ def changes_page(comparison: Comparison, views: Sequence[ShownView], maps: Seque
         ],
         "data": {"views": [_view_data(comparison, view, maps) for view in views]},
     }  # fmt: skip
-    values["data"] = _script_json(values["data"])
     page = fill_template("unmix_plugin.comparing", "changes.html", values)
     return page.encode("utf-8", "backslashreplace")
-
-
-def _script_json(values: Any) -> str:
-    """JSON that may stand in a script element, whatever the names in it."""
-    text = json.dumps(values)
-    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
 def _facts(comparison: Comparison) -> list[tuple[str, str]]:

@@ -19,7 +19,10 @@ def fill_template(
     values: Mapping[str, Any],
     filters: Mapping[str, Callable[..., Any]] | None = None,
 ) -> str:
-    """A template in a package's folder, filled in; text is escaped, and a value that is missing is an error."""
+    """A template in a package's folder, filled in; text is escaped, and a value that is missing is an error.
+
+    `VALUE | tojson` is JSON that may stand in a script element, whatever the names in it.
+    """
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(
@@ -29,6 +32,7 @@ def fill_template(
         lstrip_blocks=True,
         undefined=StrictUndefined,
     )
+    environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
     environment.filters |= filters or {}
     return environment.get_template(name).render(values)
 

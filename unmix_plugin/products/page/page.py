@@ -34,6 +34,7 @@ from unmix_plugin.editing.recipe import Light
 from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.figures.paint import colour_table
 from unmix_plugin.formats.files import eight_bits, write_file
+from unmix_plugin.formats.html import fill_template
 from unmix_plugin.formats.libraries import library_of
 from unmix_plugin.products.mesh import find_surface
 from unmix_plugin.products.product import Job
@@ -166,7 +167,7 @@ def _light_of(materials: Materials) -> Float64[np.ndarray, " B"] | None:
 
 
 def _page(job: Job, content: PageContent, known: _KnownSpectra, title: str) -> bytes:
-    """The whole page."""
+    """The whole page: the template with scripts and data in it."""
     arrays, layout = _packed({**content.arrays, "known": known.steps})
     scale = job.loaded.scale
     name = title or job.loaded.scene_name
@@ -197,7 +198,15 @@ def _page(job: Job, content: PageContent, known: _KnownSpectra, title: str) -> b
         "up": rounded(world_up(job.loaded.scene.views, job.frame)),
         "cameras": cameras,
     }
-    return _fill(facts, arrays, content.pictures)
+    try:
+        scripts = [(Path(__file__).parent / name).read_text(encoding="utf-8") for name in _SCRIPTS]
+    except OSError as error:
+        raise ConfigError(
+            f"the installation lacks the page's scripts ({error}); install unmix-nerf again"
+        ) from error
+    pictures = {caption: base64.b64encode(content).decode() for caption, content in content.pictures.items()}
+    values = {"facts": facts, "arrays": arrays, "pictures": pictures, "scripts": scripts, "title": name}
+    return fill_template("unmix_plugin.products.page", "page.html", values).encode()
 
 
 def _coarser(resolution: int, part: float) -> int:
@@ -395,24 +404,3 @@ def rounded(values: Float[np.ndarray, "..."]) -> list[Any]:
 def _colour_map() -> list[list[int]]:
     """Of values from 0 to 1, in 256 steps of 8 bits: viridis."""
     return np.round(255 * colour_table("viridis")).astype(int).tolist()
-
-
-def _fill(facts: dict[str, Any], arrays: str, shown: dict[str, bytes]) -> bytes:
-    """The template with scripts and data in it; nothing of the data can end its element."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    try:
-        loader = PackageLoader("unmix_plugin.products.page", ".")
-        environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined)
-        scripts = [(Path(__file__).parent / name).read_text(encoding="utf-8") for name in _SCRIPTS]
-    except OSError as error:
-        raise ConfigError(
-            f"the installation lacks the page's scripts ({error}); install unmix-nerf again"
-        ) from error
-    pictures = {caption: base64.b64encode(content).decode() for caption, content in shown.items()}
-    text = json.dumps(facts, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
-    return (
-        environment.get_template("page.html")
-        .render(facts=text, arrays=arrays, pictures=pictures, scripts=scripts, title=facts["title"])
-        .encode()
-    )
