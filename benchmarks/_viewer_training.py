@@ -24,7 +24,7 @@ UNTIMED_STEPS = 10
 _PAGE = """
 import contextlib, sys, time
 sys.path.insert(0, {folder!r})
-from tests.viewer_page import ConnectionClosed, Page
+from tests.factories.viewer_page import ConnectionClosed, Page
 with contextlib.suppress(OSError, ConnectionClosed), Page({address!r}, width=512, height=512) as page:
     page.look_from(0.3)
     print("there", flush=True)

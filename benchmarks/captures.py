@@ -106,7 +106,7 @@ def process(capture: Path, scene: Path, poses: str, mask: str) -> float:
 
 def pose_errors(scene: Path, capture: Path, views: int) -> dict[str, float]:
     """Share of registered views, and how far their poses are from the truth."""
-    from tests.captures.poses.alignment import align_poses
+    from tests.factories.poses import align_poses
     from unmix_plugin.captures.poses.reading import read_poses
 
     estimated, truth = read_poses(scene / "transforms.json"), read_poses(capture / "poses-true.json")

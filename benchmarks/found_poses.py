@@ -169,7 +169,7 @@ def process(capture: Path, scene: Path, *poses: str) -> str | None:
 
 def attempt(words: list[str]) -> str | None:
     """Run unmix-process; the first sentence of the message if it refuses."""
-    from tests.commands.running import run
+    from tests.factories.commands import run
     from unmix_plugin.commands.process import process as command
 
     ended = run(command, *words)
@@ -180,7 +180,7 @@ def attempt(words: list[str]) -> str | None:
 
 def errors(scene: Path, truth_file: Path) -> dict[str, Any]:
     """Registered views, how far they are from the truth, and what unmix-process said of them."""
-    from tests.captures.poses.alignment import align_poses
+    from tests.factories.poses import align_poses
     from unmix_plugin.captures.poses.reading import read_poses
 
     found, truth = read_poses(scene / "transforms.json"), read_poses(truth_file)

@@ -29,9 +29,8 @@ import tyro
 
 sys.path.insert(0, str(_common.REPOSITORY))  # for makers of captures and damage, which lie with the tests
 
-from tests.captures import capture_factory
-from tests.captures.layouts import data_sets, rig_flight
 from tests.commands.conftest import small_run
+from tests.factories import captures, data_sets, rig_flight
 from tests.fuzz.capture_samples import ENVI_DATA, SAMPLES
 from tests.fuzz.mutation import mutate_bytes, mutate_json, mutate_png
 from unmix_plugin.commands.entry import run_command
@@ -146,9 +145,9 @@ def make_folders(place: Path) -> dict[str, tuple[str, ...]]:
 
     own = ("--poses", "IN/transforms.json", "--mask", "none")
     references = ("--white", "IN/white.hdr", "--dark", "IN/dark.hdr")
-    capture_factory.make_capture(add("envi", "cubes", "--poses", "IN/transforms.json"))
-    capture_factory.make_capture(add("envi-references", "cubes", *own, *references))
-    capture_factory.make_capture(
+    captures.make_capture(add("envi", "cubes", "--poses", "IN/transforms.json"))
+    captures.make_capture(add("envi-references", "cubes", *own, *references))
+    captures.make_capture(
         add("npy", "cubes", *own, "--wavelengths", "450,500,550,600,650,700,750,800,850"), kind="npy"
     )
     for file_name, samples in SAMPLES.items():
@@ -159,7 +158,7 @@ def make_folders(place: Path) -> dict[str, tuple[str, ...]]:
             (root / name).write_bytes(samples()[0])
             if file_name.endswith(".hdr"):
                 (root / f"view{index}").write_bytes(ENVI_DATA)
-        capture_factory.write_poses(root / "transforms.json", [f"view{i}" for i in range(4)], 4, 5)
+        captures.write_poses(root / "transforms.json", [f"view{i}" for i in range(4)], 4, 5)
     data_sets.write_nespof(add("nespof", "nespof"))
     data_sets.write_real(add("nespof-real", "nespof-real"))
     data_sets.write_unmix(add("unmix-nerf", "unmix-nerf"))

@@ -31,7 +31,7 @@ from _viewer_training import TrainingSpeed, measure_training
 
 sys.path.insert(0, str(_common.REPOSITORY))  # for the page, which lies with the tests
 
-from tests.viewer_page import Page
+from tests.factories.viewer_page import Page
 from unmix_plugin.engine.configs import DeviceName
 
 FIRST_PICTURE = _common.Limit(150, is_upper=True, unit=" ms")

@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 from torch.testing import assert_close
 
-from tests.scenes.scene_factory import make_scene
+from tests.factories.scenes import make_scene
 from unmix_plugin import datamanager
 from unmix_plugin.datamanager import HyperspectralDataManager
 from unmix_plugin.engine.runs.run_folder import RunFolder

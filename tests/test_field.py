@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.method_factory import BOX, CONFIG
+from tests.factories.models import BOX, CONFIG
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.field import FieldSpace, UnmixField
 from unmix_plugin.light.shading import direction_features

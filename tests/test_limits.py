@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from tests.captures.poses.pose_factory import ring, transforms
-from tests.systems import needs_posix
+from tests.factories.poses import ring, transforms
+from tests.factories.systems import needs_posix
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.errors import SceneError, SpectrumError
 from unmix_plugin.formats.libraries import library_of, read_library

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.method_factory import CAMERA, CONFIG, NUM_BANDS, make_model, make_rays
+from tests.factories.models import CAMERA, CONFIG, NUM_BANDS, make_model, make_rays
 from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.model import UnmixModel
 from unmix_plugin.operators.compositing import volume_weights_twin

@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.method_factory import NUM_BANDS, WAVELENGTHS_NM, initial_data, make_model, make_rays
+from tests.factories.models import NUM_BANDS, WAVELENGTHS_NM, initial_data, make_model, make_rays
 from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.settings import LossConfig, UnmixModelConfig
 

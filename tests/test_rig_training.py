@@ -7,9 +7,9 @@ import numpy as np
 import torch
 from torch.testing import assert_close
 
-from tests import method_factory
-from tests.method_factory import NUM_BANDS, initial_data, make_rays
-from tests.scenes.rig_factory import make_rig
+from tests.factories import models
+from tests.factories.models import NUM_BANDS, initial_data, make_rays
+from tests.factories.scenes import make_rig
 from unmix_plugin.datamanager import HyperspectralDataManager
 from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.model import UnmixModel
@@ -25,7 +25,7 @@ PIXELS, RAYS = (6, 3), (1, 4)
 def make_model(**settings) -> UnmixModel:
     pixels = initial_data()["pixels"]
     seen = {"pixels": pixels[:, BANDS], "sensor": np.array(0), "typical": pixels.mean(axis=0)}
-    return method_factory.make_model(more_metadata={"sensors": SENSORS}, more_data=seen, **settings).train()
+    return models.make_model(more_metadata={"sensors": SENSORS}, more_data=seen, **settings).train()
 
 
 def make_batch() -> tuple[RayBundle, list[MeasuredPixels]]:

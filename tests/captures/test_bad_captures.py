@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.captures.capture_factory import (
+from tests.factories.captures import (
     BANDS,
     HEIGHT,
     WAVELENGTHS_NM,
@@ -20,7 +20,7 @@ from tests.captures.capture_factory import (
     write_cube,
     write_poses,
 )
-from tests.commands.running import done, refused
+from tests.factories.commands import done, refused
 from unmix_plugin.commands.process import process as process_command
 from unmix_plugin.errors import UnmixError
 

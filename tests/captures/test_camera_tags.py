@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.captures.file_factory import file_of, present, write_band_file, xmp_packet
+from tests.factories.files import file_of, present, write_band_file, xmp_packet
 from unmix_plugin.captures.camera_tags import (
     _RadiometricModel,
     band_of,

@@ -11,8 +11,8 @@ import pytest
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
-from tests.captures.file_factory import present
-from tests.scenes.scene_factory import look_at
+from tests.factories.files import present
+from tests.factories.scenes import look_at
 from unmix_plugin.captures.checks import SeenView, check_views
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.captures.file_factory import exposure_of_file, file_of, present, warnings_of
+from tests.factories.files import exposure_of_file, file_of, present, warnings_of
 from unmix_plugin.captures.calibration.exposures import exposure_of
 from unmix_plugin.captures.cube import BandTable, Cube, linear_values
 from unmix_plugin.captures.numbers import Held, Numbers

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.captures.file_factory import check_file, present
-from tests.captures.poses.alignment import align_poses
-from tests.commands.running import done
+from tests.factories.commands import done
+from tests.factories.files import check_file, present
+from tests.factories.poses import align_poses
 from unmix_plugin.captures import demo as demo_capture
 from unmix_plugin.captures.demo import MARKER_FAMILY, MARKER_SIZE, make_demo_capture, marked_place
 from unmix_plugin.captures.poses.lens import Lens

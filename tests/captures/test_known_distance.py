@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.captures.capture_factory import HEIGHT, WIDTH, make_capture, process
-from tests.captures.poses.pose_factory import by_hand
+from tests.factories.captures import HEIGHT, WIDTH, make_capture, process
+from tests.factories.poses import by_hand
 from unmix_plugin.captures import process as process_module
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.errors import ConfigError

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tests.captures.capture_factory import HEIGHT, WIDTH, make_capture, process
-from tests.commands.running import done
+from tests.factories.captures import HEIGHT, WIDTH, make_capture, process
+from tests.factories.commands import done
 from unmix_plugin.captures import demo as demo_capture
 from unmix_plugin.captures.demo import make_demo_capture
 from unmix_plugin.captures.demo_lines import (

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.captures.capture_factory import HEIGHT, WIDTH, make_capture, process
-from tests.captures.file_factory import file_of
+from tests.factories.captures import HEIGHT, WIDTH, make_capture, process
+from tests.factories.files import file_of
 from unmix_plugin.captures.calibration.calibration import Calibration, Raster
 from unmix_plugin.captures.cube import CaptureView
 from unmix_plugin.captures.decide import background_rule, choose_mask

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 from scipy import ndimage
 
-from tests.scenes.scene_factory import look_at
+from tests.factories.scenes import look_at
 from unmix_plugin.captures.match_checks import MatchedScene, MatchedView, check_matches, views_of_other_poses
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.pose_set import PosedCamera

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from tests.captures.capture_factory import HEIGHT, WAVELENGTHS_NM, WIDTH, process, write_poses
+from tests.factories.captures import HEIGHT, WAVELENGTHS_NM, WIDTH, process, write_poses
 from unmix_plugin import limits
 from unmix_plugin.captures import numbers
 from unmix_plugin.captures.readers.opening import open_spectral_file

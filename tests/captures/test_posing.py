@@ -8,11 +8,10 @@ import pytest
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
-from tests.captures.file_factory import file_of, present
-from tests.captures.poses.alignment import SIMILARITY, elsewhere, in_a_row
-from tests.captures.poses.pose_factory import ring_set, transforms, write_json
-from tests.scenes.geometry.ground_views import flight_poses
-from tests.scenes.scene_factory import make_scene, ring_poses
+from tests.factories.files import file_of, present
+from tests.factories.ground_views import flight_poses
+from tests.factories.poses import SIMILARITY, elsewhere, in_a_row, ring_set, transforms, write_json
+from tests.factories.scenes import make_scene, ring_poses
 from unmix_plugin.captures.cube import CameraTags, CaptureView, Cube
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet

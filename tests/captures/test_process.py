@@ -13,7 +13,7 @@ import torch
 from filelock import FileLock
 from PIL import Image
 
-from tests.captures.capture_factory import (
+from tests.factories.captures import (
     BANDS,
     HEIGHT,
     WAVELENGTHS_NM,
@@ -23,7 +23,7 @@ from tests.captures.capture_factory import (
     write_cube,
     write_poses,
 )
-from tests.captures.file_factory import present
+from tests.factories.files import present
 from unmix_plugin.captures import process as process_module
 from unmix_plugin.captures.cube import ReadOptions
 from unmix_plugin.captures.layouts.cubes import find_cubes

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.captures.capture_factory import process, write_poses
+from tests.factories.captures import process, write_poses
 from unmix_plugin.errors import CaptureError
 
 SIDE, BANDS = 16, 9

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from tests.captures.capture_factory import BANDS, HEIGHT, WIDTH, make_capture, process, write_cube
+from tests.factories.captures import BANDS, HEIGHT, WIDTH, make_capture, process, write_cube
 from unmix_plugin.captures.report import Code
 from unmix_plugin.captures.spoilt import ViewPixels, judge_sharpness, judge_values, sharpness_of
 from unmix_plugin.errors import CaptureError, ConfigError

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.captures.file_factory import file_of
+from tests.factories.files import file_of
 from unmix_plugin.captures.cube import BandTable, CaptureView
 from unmix_plugin.captures.decide import is_below_black
 from unmix_plugin.captures.options import ProcessOptions

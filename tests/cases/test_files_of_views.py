@@ -11,8 +11,8 @@ import pytest
 import tifffile
 from PIL import Image
 
-from tests.captures.file_factory import gdal_items, gdal_tag
-from tests.cases.inputs import (
+from tests.factories.files import gdal_items, gdal_tag
+from tests.factories.forms import (
     FOCAL_PX,
     HEIGHT,
     RED_GREEN_BLUE,

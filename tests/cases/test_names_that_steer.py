@@ -9,8 +9,8 @@ import h5py
 import numpy as np
 import pytest
 
-from tests.cases.inputs import VIEWS, WAVELENGTHS_NM, cube, processed, write_envi, write_transforms
-from tests.commands.running import SMALL_METHOD, run
+from tests.factories.commands import SMALL_METHOD, run
+from tests.factories.forms import VIEWS, WAVELENGTHS_NM, cube, processed, write_envi, write_transforms
 from unmix_plugin.commands.process import process
 from unmix_plugin.commands.train import train
 

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from tests.cases.inputs import (
+from tests.factories.forms import (
     FOCAL_PX,
     HEIGHT,
     RED_GREEN_BLUE,

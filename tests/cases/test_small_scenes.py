@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.cases.inputs import WAVELENGTHS_NM, cube, ring, write_envi, write_transforms
-from tests.commands.running import SMALL_METHOD, run
+from tests.factories.commands import SMALL_METHOD, run
+from tests.factories.forms import WAVELENGTHS_NM, cube, ring, write_envi, write_transforms
 from unmix_plugin.commands.process import process
 from unmix_plugin.commands.train import train
 from unmix_plugin.spectral.library.spectra_csv import read_spectra

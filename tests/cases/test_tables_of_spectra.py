@@ -10,7 +10,7 @@ import re
 import numpy as np
 import pytest
 
-from tests.cases.inputs import braced, spectra
+from tests.factories.forms import braced, spectra
 from unmix_plugin.captures.wavelengths import parse_wavelengths
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.formats.libraries import library_of, read_library

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.commands.running import SMALL_METHOD, Ended, done, run_of
-from tests.products.few_rays import few_rays
+from tests.factories.ball_model import few_rays
+from tests.factories.commands import SMALL_METHOD, Ended, done, run_of
 from unmix_plugin.commands.export import PRODUCTS, export
 from unmix_plugin.commands.train import train
 from unmix_plugin.products.product import RunProduct

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from tests.commands.running import done, refused
-from tests.neumatex.factory import CENTRE, LAMP, WAVELENGTHS, write_spectral_object
+from tests.factories.commands import done, refused
+from tests.factories.objects import CENTRE, LAMP, WAVELENGTHS, write_spectral_object
 from unmix_plugin.commands.asset import asset
 from unmix_plugin.neumatex.tracing.light_files import read_exr
 

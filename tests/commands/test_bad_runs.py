@@ -9,8 +9,8 @@ import pytest
 import safetensors.torch
 import torch
 
-from tests.commands.running import done, refused
-from tests.formats.cubes import full_disk
+from tests.factories.commands import done, refused
+from tests.factories.cubes import full_disk
 from unmix_plugin.commands.eval import evaluate
 from unmix_plugin.commands.export import export
 from unmix_plugin.commands.render import render

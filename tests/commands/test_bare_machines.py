@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.commands.running import run
-from tests.systems import needs_posix
+from tests.factories.commands import run
+from tests.factories.systems import needs_posix
 from unmix_plugin.commands.demo_scene import write_demo_scene
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -5,7 +5,7 @@ import shlex
 
 import pytest
 
-from tests.commands.running import done, refused, run
+from tests.factories.commands import done, refused, run
 from unmix_plugin.commands.demo_scene import write_demo_scene
 
 SMALL = ["--size", "16", "--bands", "3", "--views", "4"]

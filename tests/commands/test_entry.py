@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 import torch
 
-from tests.commands.running import run
-from tests.systems import SIGNALS_TO_END, needs_posix
+from tests.factories.commands import run
+from tests.factories.systems import SIGNALS_TO_END, needs_posix
 from unmix_plugin.commands.entry import run_command
 from unmix_plugin.errors import ConfigError, SceneError, UnmixWarning
 

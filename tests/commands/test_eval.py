@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from tests.commands.conftest import small_run
-from tests.commands.running import done, picture_size, refused
+from tests.factories.commands import done, picture_size, refused
 from unmix_plugin.commands.eval import evaluate
 from unmix_plugin.engine.processes import ALONE
 from unmix_plugin.engine.runs.load_run import load_pipeline

@@ -16,11 +16,11 @@ from plyfile import PlyData
 
 from tests.commands.conftest import PRODUCT_NAMES
 from tests.commands.conftest import export_words as words
-from tests.commands.running import done, picture_size, refused, run
 from tests.engine.conftest import registered, short_config  # noqa: F401 (fixtures)
-from tests.engine.stopped_runs import finished
-from tests.products.mesh_reading import loaded_mesh
-from tests.products.report.page_outline import assert_self_contained
+from tests.factories.commands import done, picture_size, refused, run
+from tests.factories.outputs import loaded_mesh
+from tests.factories.pages import assert_self_contained
+from tests.factories.trainings import finished
 from unmix_plugin.commands.export import export
 from unmix_plugin.engine import registry
 from unmix_plugin.engine.runs.run_folder import RunFolder
@@ -49,7 +49,7 @@ def test_views_are_chosen_by_split_and_named_as_the_frames(trained, tmp_path):
 
 
 def entry(name, value):
-    return EntryPoint(name, f"tests.commands.own_product_plugin:{value}", registry.METHOD_GROUP)
+    return EntryPoint(name, f"tests.factories.own_product:{value}", registry.METHOD_GROUP)
 
 
 @pytest.fixture

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.captures.capture_factory import make_capture
 from tests.commands.conftest import PRODUCT_NAMES, export_words
-from tests.commands.running import done, run
-from tests.spectral.mixtures import smooth_endmembers
+from tests.factories.captures import make_capture
+from tests.factories.commands import done, run
+from tests.factories.mixtures import smooth_endmembers
+from tests.factories.systems import needs_posix
 from tests.spectral.unmixing.test_image import image_of
-from tests.systems import needs_posix
 from unmix_plugin import open_run, save
 from unmix_plugin.commands.demo_scene import write_demo_scene
 from unmix_plugin.commands.eval import evaluate

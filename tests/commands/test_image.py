@@ -7,9 +7,9 @@ import pytest
 from PIL import Image
 from scipy.io import savemat
 
-from tests.captures.file_factory import write_envi
-from tests.commands.running import done, picture_size, refused, run
-from tests.spectral.mixtures import smooth_endmembers
+from tests.factories.commands import done, picture_size, refused, run
+from tests.factories.files import write_envi
+from tests.factories.mixtures import smooth_endmembers
 from tests.spectral.unmixing.test_image import image_of
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.commands.image import image

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from tests.commands.running import done, refused, run
 from tests.engine.conftest import (  # noqa: F401 (fixtures)
     RGB_NERF_ENTRY,
     registered,
     short_config,
     trained_once,
 )
-from tests.engine.rgb_nerf_plugin import RgbNerf, RgbNerfConfig
+from tests.factories.commands import done, refused, run
+from tests.factories.rgb_nerf import RgbNerf, RgbNerfConfig
 from unmix_plugin.commands.eval import evaluate
 from unmix_plugin.commands.export import export
 from unmix_plugin.commands.render import render

@@ -6,9 +6,9 @@ import shutil
 import numpy as np
 import pytest
 
-from tests.commands.running import done, refused, run
-from tests.formats.video_reading import read_video
-from tests.products.render.render_factory import read_envi, read_exr
+from tests.factories.commands import done, refused, run
+from tests.factories.outputs import read_video
+from tests.factories.renders import read_envi, read_exr
 from unmix_plugin.commands.render import render
 from unmix_plugin.editing.edited_run import load_edited_run
 from unmix_plugin.engine import processes

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.commands.running import SMALL_METHOD, done
-from tests.scenes.rig_factory import make_rig
+from tests.factories.commands import SMALL_METHOD, done
+from tests.factories.scenes import make_rig
 from unmix_plugin.commands.eval import evaluate
 from unmix_plugin.commands.export import export
 from unmix_plugin.commands.render import render

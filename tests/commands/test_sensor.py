@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from tests.commands.running import done, refused
-from tests.products.render.render_factory import read_envi
+from tests.factories.commands import done, refused
+from tests.factories.renders import read_envi
 from unmix_plugin.commands.export import export
 from unmix_plugin.commands.render import render
 from unmix_plugin.spectral.bands import Bands

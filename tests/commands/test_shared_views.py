@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from tests.commands.running import done, refused, run
-from tests.formats.video_reading import read_video
+from tests.factories.commands import done, refused, run
+from tests.factories.outputs import read_video
 from unmix_plugin.commands.export import PRODUCTS, _write, export
 from unmix_plugin.commands.render import render
 from unmix_plugin.engine.processes import Processes

@@ -10,7 +10,7 @@ import time
 
 import pytest
 
-from tests.systems import needs_posix
+from tests.factories.systems import needs_posix
 from unmix_plugin.scenes.demo.scene import make_demo_scene
 
 pytestmark = needs_posix

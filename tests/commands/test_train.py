@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import unmix_plugin
-from tests.commands.running import SMALL_METHOD, done, refused, run, run_of
-from tests.formats.cubes import full_disk
+from tests.factories.commands import SMALL_METHOD, done, refused, run, run_of
+from tests.factories.cubes import full_disk
 from unmix_plugin.commands.train import parse, train
 from unmix_plugin.commands.training import remark_on_passes, remarks_on_course
 from unmix_plugin.engine import registry

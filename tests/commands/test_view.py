@@ -7,11 +7,10 @@ from contextlib import contextmanager
 
 import pytest
 
-from tests.commands.running import refused
 from tests.commands.test_bad_runs import contents
-from tests.commands.watching import START_S, address, looking, started, visited
-from tests.formats.video_reading import read_video
-from tests.systems import SIGNALS_TO_END, needs_posix
+from tests.factories.commands import START_S, address, looking, refused, started, visited
+from tests.factories.outputs import read_video
+from tests.factories.systems import SIGNALS_TO_END, needs_posix
 from unmix_plugin.commands.view import ViewOptions, prepared, view
 from unmix_plugin.viewer.access import ViewerOptions
 from unmix_plugin.viewer.rendering.scene import MeasuredViews

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.commands.browser import CHROMIUM, FLAGS, NEEDS_BROWSER
-from tests.viewer.pages import serving
-from tests.viewer.view_factory import make_source
+from tests.factories.commands import CHROMIUM, FLAGS, NEEDS_BROWSER
+from tests.factories.viewers import serving
+from tests.factories.views import make_source
 from unmix_plugin.commands.view import ViewOptions, prepared
 from unmix_plugin.viewer.access import ViewerOptions
 from unmix_plugin.viewer.rendering.painting import LAYERS

@@ -8,10 +8,9 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from tests.commands.running import SMALL_METHOD, done, refused
-from tests.commands.watching import START_S, address, looking, started, visited
-from tests.systems import needs_posix
-from tests.viewer_page import Page
+from tests.factories.commands import SMALL_METHOD, START_S, address, done, looking, refused, started, visited
+from tests.factories.systems import needs_posix
+from tests.factories.viewer_page import Page
 from unmix_plugin.commands import train as train_module
 from unmix_plugin.commands.train import parse, train
 from unmix_plugin.engine.training.trainer import Trainer

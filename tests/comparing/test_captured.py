@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.products.ball_model import ALL_ROUND, RADIUS, ball_scene, cameras_around
+from tests.factories.ball_model import ALL_ROUND, RADIUS, ball_scene, cameras_around
 from unmix_plugin.comparing.captured import Capture
 from unmix_plugin.trained.places import MeasuredScene
 from unmix_plugin.trained.run_views import RunView

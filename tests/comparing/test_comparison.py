@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.comparing.objects import (
+from tests.factories.changed_objects import (
     BANDS,
     CHALK,
     CLAY,

@@ -10,7 +10,7 @@ import pytest
 import torch
 from plyfile import PlyData
 
-from tests.comparing.objects import CHALK, MOVED, capture, later, surface_of_shape
+from tests.factories.changed_objects import CHALK, MOVED, capture, later, surface_of_shape
 from unmix_plugin.comparing.comparison import compare
 from unmix_plugin.comparing.files import ChangeFiles
 from unmix_plugin.comparing.shown import carried_camera

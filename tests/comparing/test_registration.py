@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.comparing.objects import MOVED, PIXEL, in_world, lumpy, surface_of_shape
+from tests.factories.changed_objects import MOVED, PIXEL, in_world, lumpy, surface_of_shape
 from unmix_plugin.comparing.registration import Similarity, light_between, register
 from unmix_plugin.errors import ConfigError
 

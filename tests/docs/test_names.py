@@ -5,8 +5,8 @@ import re
 
 import pytest
 
-from tests.commands.running import run
-from tests.docs.pages import ROOT, text_of
+from tests.factories.commands import run
+from tests.factories.pages import ROOT, text_of
 from tests.test_public_surface import METHODS
 from unmix_plugin.commands.process_inspect import inspect_command
 from unmix_plugin.commands.train import train

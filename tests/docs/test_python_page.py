@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import unmix_plugin
-from tests.commands.running import picture_size
-from tests.docs.pages import blocks_of, text_of
-from tests.method_factory import CAMERA, make_scene
+from tests.factories.commands import picture_size
+from tests.factories.models import CAMERA, make_scene
+from tests.factories.pages import blocks_of, text_of
 from unmix_plugin import read_recipe
 from unmix_plugin.editing import edit_scene, recipe_from_yaml
 

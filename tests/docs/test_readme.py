@@ -7,8 +7,8 @@ from importlib import import_module
 
 import pytest
 
-from tests.commands.running import SMALL_METHOD, done, run_of
-from tests.docs.pages import ROOT, blocks_of, text_of
+from tests.factories.commands import SMALL_METHOD, done, run_of
+from tests.factories.pages import ROOT, blocks_of, text_of
 from tests.test_public_surface import COMMANDS
 from unmix_plugin.products.page import page as page_module
 

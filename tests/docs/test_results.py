@@ -10,7 +10,7 @@ import sys
 
 import pytest
 
-from tests.docs.pages import ROOT, text_of
+from tests.factories.pages import ROOT, text_of
 
 
 def module_of(path):

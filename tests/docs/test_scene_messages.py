@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-from tests.docs.pages import ROOT, text_of
+from tests.factories.pages import ROOT, text_of
 from unmix_plugin.scenes.messages import Message
 
 PAGE = "docs/reference/scene-folder.md"

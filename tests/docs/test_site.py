@@ -11,7 +11,7 @@ import pytest
 
 from scripts.check_site import faults_of
 from scripts.stage_site import COMMANDS, messages_in
-from tests.docs.pages import ROOT, text_of
+from tests.factories.pages import ROOT, text_of
 
 PAGE = "<html><head><script src='{load}'></script></head><body><article><a href='{link}'>x</a></article></body></html>"
 

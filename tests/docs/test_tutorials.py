@@ -9,7 +9,7 @@ import sys
 import pytest
 
 from scripts.stage_site import parser_of
-from tests.docs.pages import ROOT
+from tests.factories.pages import ROOT
 from unmix_plugin.engine import find_method
 from unmix_plugin.scenes.demo.scene import demo_scene_path
 

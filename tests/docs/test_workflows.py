@@ -6,7 +6,7 @@ import shlex
 import pytest
 import yaml
 
-from tests.docs.pages import ROOT, text_of
+from tests.factories.pages import ROOT, text_of
 
 TARGETS = set(re.findall(r"^([\w-]+):(?!=)", text_of("Makefile"), re.MULTILINE))
 WORKFLOWS = sorted((ROOT / ".github/workflows").glob("*.yml"))

@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.editing.scenes import CAMERAS, LIGHT, edited, lit_scene, recipe, rendered, tensors_of
-from tests.method_factory import NUM_BANDS, WAVELENGTHS_NM, make_scene
+from tests.factories.edited_scenes import CAMERAS, LIGHT, edited, lit_scene, recipe, rendered, tensors_of
+from tests.factories.models import NUM_BANDS, WAVELENGTHS_NM, make_scene
 from unmix_plugin.editing import Light, Recipe, Remove, Scale, changes_geometry, edit_scene
 from unmix_plugin.editing.apply import assumption_of_light
 from unmix_plugin.errors import ConfigError

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.testing import assert_close
 
-from tests.editing.scenes import CAMERAS, LIGHT, edited, lit_scene, rendered, tensors_of
-from tests.method_factory import WAVELENGTHS_NM, make_scene
+from tests.factories.edited_scenes import CAMERAS, LIGHT, edited, lit_scene, rendered, tensors_of
+from tests.factories.models import WAVELENGTHS_NM, make_scene
 from unmix_plugin.editing import Light, Recipe, edit_scene
 from unmix_plugin.editing.apply import _retinted, relighting_factors, with_sensor
 from unmix_plugin.errors import SpectrumError

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from tests.editing.scenes import CAMERAS, LIGHT, edited, lit_scene
+from tests.factories.edited_scenes import CAMERAS, LIGHT, edited, lit_scene
 from unmix_plugin.editing import sample_seen
 from unmix_plugin.editing.edited_field import Appearance, EditedField, MaterialState, appearance_of
 from unmix_plugin.field import CoefficientField

@@ -8,9 +8,9 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.commands.running import SMALL_METHOD, done, run_of
-from tests.editing.scenes import lit_scene, tensors_of
-from tests.method_factory import make_model
+from tests.factories.commands import SMALL_METHOD, done, run_of
+from tests.factories.edited_scenes import lit_scene, tensors_of
+from tests.factories.models import make_model
 from unmix_plugin.commands.train import train
 from unmix_plugin.editing import Light, Recipe, Rename, Scale, edited_run
 from unmix_plugin.editing.apply import edit_scene, light_factors

@@ -7,13 +7,13 @@ from shutil import copytree
 
 import pytest
 
-from tests.engine.rgb_nerf_plugin import rgb_nerf
+from tests.factories.rgb_nerf import rgb_nerf
 from unmix_plugin.engine import registry
 from unmix_plugin.engine.configs import TrainerConfig
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.engine.training.trainer import Trainer
 
-RGB_NERF_ENTRY = EntryPoint("rgb-nerf", "tests.engine.rgb_nerf_plugin:rgb_nerf", registry.METHOD_GROUP)
+RGB_NERF_ENTRY = EntryPoint("rgb-nerf", "tests.factories.rgb_nerf:rgb_nerf", registry.METHOD_GROUP)
 
 
 @pytest.fixture

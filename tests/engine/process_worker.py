@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from tests.engine.rgb_nerf_plugin import rgb_nerf
+from tests.factories.rgb_nerf import rgb_nerf
 from unmix_plugin.commands.entry import run_command
 from unmix_plugin.engine.pipeline import Pipeline
 from unmix_plugin.engine.runs import load_run

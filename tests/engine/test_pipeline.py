@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from tests.engine.rgb_nerf_plugin import RgbNerf
-from tests.engine.stopped_runs import finished, quiet_trainer
+from tests.factories.rgb_nerf import RgbNerf
+from tests.factories.trainings import finished, quiet_trainer
 from unmix_plugin.engine.model import TrainingCallback, TrainingCallbackLocation
 from unmix_plugin.engine.runs.load_run import load_pipeline
 from unmix_plugin.errors import ConfigError

@@ -11,7 +11,7 @@ from typing import Any, get_args
 import pytest
 
 import unmix_plugin.engine
-from tests.commands.running import done, run
+from tests.factories.commands import done, run
 from unmix_plugin.commands.eval import evaluate
 from unmix_plugin.commands.render import render
 from unmix_plugin.commands.train import train

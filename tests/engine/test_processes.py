@@ -14,7 +14,7 @@ import torch
 from torch import distributed
 
 from tests.engine.process_worker import STEPS, config_for, fixed_batch
-from tests.systems import needs_posix
+from tests.factories.systems import needs_posix
 from unmix_plugin.engine import processes
 from unmix_plugin.engine.processes import (
     ALONE,

@@ -5,7 +5,7 @@ from importlib.metadata import EntryPoint
 
 import pytest
 
-from tests.engine.rgb_nerf_plugin import rgb_nerf
+from tests.factories.rgb_nerf import rgb_nerf
 from unmix_plugin.engine.registry import METHOD_GROUP, MethodSpecification, discover_methods, find_method
 from unmix_plugin.errors import ConfigError
 
@@ -32,8 +32,8 @@ def test_settings_have_the_name_of_the_method_by_which_their_runs_are_found_agai
     ("value", "reason"),
     [
         ("no_such_module_at_all:method", "ModuleNotFoundError: No module named 'no_such_module_at_all'"),
-        ("tests.engine.rgb_nerf_plugin:no_such_name", "AttributeError"),
-        ("tests.engine.rgb_nerf_plugin:VIEWS", "is a int, not a MethodSpecification"),
+        ("tests.factories.rgb_nerf:no_such_name", "AttributeError"),
+        ("tests.factories.rgb_nerf:VIEWS", "is a int, not a MethodSpecification"),
         ("plugin_that_fails:method", "RuntimeError: this plugin fails on import"),
     ],
 )

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.engine import rgb_nerf_plugin
-from tests.engine.rgb_nerf_plugin import GridField, RgbNerf, RgbNerfConfig
-from tests.engine.stopped_runs import finished, newest, quiet_trainer, stop_at
+from tests.factories import rgb_nerf
+from tests.factories.rgb_nerf import GridField, RgbNerf, RgbNerfConfig
+from tests.factories.trainings import finished, newest, quiet_trainer, stop_at
 from unmix_plugin.engine.registry import find_method
 from unmix_plugin.engine.runs.checkpoints import save_checkpoint
 from unmix_plugin.engine.runs.load_run import load_config, load_model, load_pipeline
@@ -20,7 +20,7 @@ from unmix_plugin.errors import ConfigError
 @pytest.mark.usefixtures("registered")
 @pytest.mark.parametrize("device", ["cpu"] + ["cuda"] * torch.cuda.is_available())
 def test_a_plain_rgb_nerf_trains_from_its_entry_point_to_23_db(tmp_path, device):
-    tree = ast.parse(Path(rgb_nerf_plugin.__file__).read_text())
+    tree = ast.parse(Path(rgb_nerf.__file__).read_text())
     modules = [node.module or "" for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
     assert [name for name in modules if name.startswith("unmix_plugin")] == ["unmix_plugin.engine"]
     (tmp_path / "ball").mkdir()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import spectral.io.envi as envi
 
-from tests.formats.cubes import BANDS, WAVELENGTHS_NM, full_disk, random_cube
+from tests.factories.cubes import BANDS, WAVELENGTHS_NM, full_disk, random_cube
 from unmix_plugin.errors import RunError
 from unmix_plugin.formats.envi import envi_cube_rows, write_envi_cube, write_envi_library
 from unmix_plugin.spectral.bands import Bands

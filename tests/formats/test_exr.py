@@ -6,7 +6,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from tests.formats.cubes import BANDS, WAVELENGTHS_NM, random_cube
+from tests.factories.cubes import BANDS, WAVELENGTHS_NM, random_cube
 from unmix_plugin.errors import RunError
 from unmix_plugin.formats.exr import write_exr, write_spectral_exr
 

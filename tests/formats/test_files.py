@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from tests.formats.cubes import full_disk, random_cube
+from tests.factories.cubes import full_disk, random_cube
 from unmix_plugin.engine.runs import atomic_files, replacing
 from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.formats.files import (

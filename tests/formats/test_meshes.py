@@ -8,7 +8,7 @@ import pytest
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
-from tests.products.mesh_reading import loaded_mesh
+from tests.factories.outputs import loaded_mesh
 from unmix_plugin.formats.meshes import least_turns, obj_paths, write_glb, write_obj, write_ply
 
 GENERATOR = np.random.default_rng(0)

@@ -6,8 +6,8 @@ import sys
 import numpy as np
 import pytest
 
-from tests.formats.video_reading import read_video
-from tests.systems import needs_posix
+from tests.factories.outputs import read_video
+from tests.factories.systems import needs_posix
 from unmix_plugin.errors import RunError
 from unmix_plugin.formats import video
 from unmix_plugin.formats.video import video_frames

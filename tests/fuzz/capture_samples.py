@@ -11,8 +11,8 @@ import numpy as np
 import tifffile
 from PIL import Image
 
-from tests.captures.file_factory import ARRAY_WRITERS, gdal_items, gdal_tag, header_text, write_band_file
-from tests.captures.layouts.data_sets import write_exr
+from tests.factories.data_sets import write_exr
+from tests.factories.files import ARRAY_WRITERS, gdal_items, gdal_tag, header_text, write_band_file
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.formats.files import array_bytes
 

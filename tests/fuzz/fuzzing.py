@@ -9,9 +9,9 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from tests.factories.systems import most_memory
 from tests.fuzz.mutation import Reader
 from tests.fuzz.readers import READERS
-from tests.systems import most_memory
 
 
 @dataclass

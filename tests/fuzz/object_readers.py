@@ -11,8 +11,8 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import trimesh
 
+from tests.factories import objects
 from tests.fuzz.mutation import Mutator, Reader, mutate_bytes, mutate_json
-from tests.neumatex import factory
 from unmix_plugin.errors import SceneError
 from unmix_plugin.neumatex.fit.object_scene import _read_folder
 from unmix_plugin.neumatex.fit.pictures import read_picture
@@ -24,8 +24,8 @@ from unmix_plugin.neumatex.tracing.mesh import read_mesh
 def _object() -> dict[str, bytes]:
     """Files of an object by their names."""
     with TemporaryDirectory() as place:
-        folder = factory.write_object(Path(place), environment_rotation_deg=30.0, tone_mapping="linear")
-        factory.write_spectral_object(folder / "spectral")
+        folder = objects.write_object(Path(place), environment_rotation_deg=30.0, tone_mapping="linear")
+        objects.write_spectral_object(folder / "spectral")
         tetrahedron = trimesh.Trimesh(np.eye(4)[:, :3], [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
         for suffix in ("ply", "obj", "glb", "gltf"):
             exported = tetrahedron.export(file_type=suffix)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.captures.poses.pose_factory import (
+from tests.factories.poses import (
     BROWN,
     CALIBRATION,
     FLIP,

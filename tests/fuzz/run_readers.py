@@ -15,8 +15,8 @@ import safetensors.torch
 import torch
 from viser._messages import Message
 
+from tests.factories.scenes import look_at
 from tests.fuzz.mutation import Reader, mutate_json
-from tests.scenes.scene_factory import look_at
 from unmix_plugin.datamanager import HyperspectralDataManager
 from unmix_plugin.editing import read_recipe, recipe_from_yaml, recipe_to_yaml
 from unmix_plugin.engine.geometry.cameras import Cameras

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from PIL import Image
 
+from tests.factories.scenes import look_at
 from tests.fuzz.mutation import Reader, mutate_json, mutate_png
-from tests.scenes.scene_factory import look_at
 from unmix_plugin.captures.poses.turntable_observations import parse_angles
 from unmix_plugin.captures.wavelengths import parse_wavelengths
 from unmix_plugin.errors import ConfigError, SceneError, SpectrumError

@@ -16,11 +16,11 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.commands.running import SMALL_METHOD, done, run_of
+from tests.factories.ball_model import few_rays
+from tests.factories.commands import SMALL_METHOD, done, run_of
+from tests.factories.objects import trained_on, write_object
+from tests.factories.refined_cameras import MIDDLE, box_around, cameras
 from tests.gpu.stand_in import StandInTensor, stand_in_gpu
-from tests.neumatex.factory import trained_on, write_object
-from tests.pose_factory import MIDDLE, box_around, cameras
-from tests.products.few_rays import few_rays
 from unmix_plugin.commands.eval import evaluate
 from unmix_plugin.commands.export import PRODUCTS, export
 from unmix_plugin.commands.render import render

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.method_factory import CAMERA, make_model
+from tests.factories.models import CAMERA, make_model
 from unmix_plugin.operators import compositing, contracted_marching, hash_encoding, marching, merging
 from unmix_plugin.operators.launching import warp
 

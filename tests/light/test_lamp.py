@@ -7,7 +7,7 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from tests.method_factory import BOX, CAMERA, CONFIG, initial_data, make_model, make_rays, scene_of
+from tests.factories.models import BOX, CAMERA, CONFIG, initial_data, make_model, make_rays, scene_of
 from unmix_plugin.editing.edited_field import EditedField
 from unmix_plugin.engine.geometry.key_poses import rotation_matrix
 from unmix_plugin.errors import ConfigError

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 import torch
 
-from tests.scenes.geometry.ball_views import LAMP, ball_views, make_cameras
-from tests.scenes.scene_factory import ring_poses
+from tests.factories.ball_views import LAMP, ball_views, make_cameras
+from tests.factories.scenes import ring_poses
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.light import search as lamp_search
 from unmix_plugin.light.search import _best_lamp, _LampEvidence, _turning_axis, find_lamp

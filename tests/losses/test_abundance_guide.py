@@ -1,7 +1,7 @@
 import torch
 from torch.testing import assert_close
 
-from tests.spectral.mixtures import seeded, smooth_endmembers
+from tests.factories.mixtures import seeded, smooth_endmembers
 from unmix_plugin.losses import abundance_guide
 from unmix_plugin.losses.abundance_guide import AbundanceGuide, mixing_penalty
 from unmix_plugin.losses.terms import LossTerm

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.method_factory import NUM_BANDS, losses_of, make_model, make_rays
+from tests.factories.models import NUM_BANDS, losses_of, make_model, make_rays
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.presets import WITHOUT_ALPHA
 from unmix_plugin.settings import LossConfig

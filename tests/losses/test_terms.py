@@ -2,8 +2,8 @@ import pytest
 import torch
 from torch import nn
 
+from tests.factories.models import BOX, NUM_BANDS, losses_of, make_model, make_rays
 from tests.light.test_lamp import model_with_lamp
-from tests.method_factory import BOX, NUM_BANDS, losses_of, make_model, make_rays
 from unmix_plugin.engine.geometry.space import UnitSpace
 from unmix_plugin.light.shading import LampShading
 from unmix_plugin.losses.terms import normals_error, stray_light

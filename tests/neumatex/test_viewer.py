@@ -5,9 +5,9 @@ import pytest
 import torch
 from PIL import Image
 
-from tests.neumatex.surfaces import RECORD, make_object
-from tests.viewer.pages import decoded, has_control, opened, serving, show_layer
-from tests.viewer.view_factory import make_source, no_scene
+from tests.factories.surfaces import RECORD, make_object
+from tests.factories.viewers import decoded, has_control, opened, serving, show_layer
+from tests.factories.views import make_source, no_scene
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.engine.training.training_control import DeviceLock
 from unmix_plugin.errors import ConfigError, SceneError

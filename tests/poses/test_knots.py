@@ -4,7 +4,7 @@ import torch
 from scipy.interpolate import BSpline
 from torch.testing import assert_close
 
-from tests.pose_factory import corrections
+from tests.factories.refined_cameras import corrections
 from unmix_plugin.poses import refinement
 from unmix_plugin.poses.knots import row_waves, spline_weights
 from unmix_plugin.poses.refinement import PoseRefinement

@@ -5,8 +5,16 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.method_factory import BOX, CONFIG, initial_data, make_model, make_rays
-from tests.pose_factory import HEIGHT, MIDDLE, box_around, cameras, corrections, refinement, some_pixels
+from tests.factories.models import BOX, CONFIG, initial_data, make_model, make_rays
+from tests.factories.refined_cameras import (
+    HEIGHT,
+    MIDDLE,
+    box_around,
+    cameras,
+    corrections,
+    refinement,
+    some_pixels,
+)
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.engine.processes import Processes

@@ -7,10 +7,9 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.engine.stopped_runs import quiet_trainer, stop_at
-from tests.method_factory import CONFIG
-from tests.scenes.line_factory import make_line_scene
-from tests.scenes.scene_factory import make_scene
+from tests.factories.models import CONFIG
+from tests.factories.scenes import make_line_scene, make_scene
+from tests.factories.trainings import quiet_trainer, stop_at
 from unmix_plugin.engine.configs import PipelineConfig, TrainerConfig
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import rotation_matrix

@@ -9,9 +9,9 @@ import trimesh
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
-from tests.products.ball_model import ALL_ROUND, ball_scene, seen_surface
-from tests.products.mesh_reading import loaded_mesh
-from tests.trained.camera_scenes import FRAME, around
+from tests.factories.ball_model import ALL_ROUND, ball_scene, seen_surface
+from tests.factories.cameras import FRAME, around
+from tests.factories.outputs import loaded_mesh
 from unmix_plugin.products.mesh import _write_mesh, gltf_content
 from unmix_plugin.products.point_cloud import _write_point_cloud
 from unmix_plugin.products.volume import _write_volume

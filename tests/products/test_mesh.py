@@ -10,7 +10,7 @@ import trimesh
 from PIL import Image
 from plyfile import PlyData
 
-from tests.products.ball_model import (
+from tests.factories.ball_model import (
     ALL_ROUND,
     DENSITY,
     EDGE,
@@ -20,9 +20,9 @@ from tests.products.ball_model import (
     ball_scene,
     seen_surface,
 )
-from tests.products.mesh_reading import loaded_mesh
-from tests.systems import needs_xatlas
-from tests.trained.camera_scenes import FRAME
+from tests.factories.cameras import FRAME
+from tests.factories.outputs import loaded_mesh
+from tests.factories.systems import needs_xatlas
 from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.products.mesh import _mesh_paths, _textures, _write_mesh, export
 from unmix_plugin.products.product import Job

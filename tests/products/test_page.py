@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from tests.captures.file_factory import present
-from tests.products.ball_page import SCENE, export
+from tests.factories.ball_page import SCENE, export
+from tests.factories.files import present
 from unmix_plugin.editing import Light, Recipe, edit_scene
 from unmix_plugin.editing.apply import with_sensor
 from unmix_plugin.errors import ConfigError, SpectrumError

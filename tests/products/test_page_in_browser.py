@@ -17,10 +17,10 @@ from PIL import Image
 from scipy.ndimage import binary_erosion
 from skimage.color import deltaE_ciede2000, rgb2lab
 
-from tests.commands.browser import CHROMIUM, FLAGS, NEEDS_BROWSER, SOFTWARE_GL
-from tests.products.ball_model import SHADE, ball_scene, cameras_around
-from tests.products.ball_page import NAMES, SCALE, SCENE, TITLE, WORLD_RADIUS, export
-from tests.trained.camera_scenes import FRAME
+from tests.factories.ball_model import SHADE, ball_scene, cameras_around
+from tests.factories.ball_page import NAMES, SCALE, SCENE, TITLE, WORLD_RADIUS, export
+from tests.factories.cameras import FRAME
+from tests.factories.commands import CHROMIUM, FLAGS, NEEDS_BROWSER, SOFTWARE_GL
 from unmix_plugin.formats.libraries import library_of
 from unmix_plugin.products.page import page
 from unmix_plugin.spectral.bands import Bands

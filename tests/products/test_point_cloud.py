@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from plyfile import PlyData
 from scipy.spatial import KDTree
 
-from tests.method_factory import WAVELENGTHS_NM, make_model
-from tests.products.ball_model import ALL_ROUND, RADIUS, ball_scene, seen_surface
-from tests.trained.camera_scenes import FRAME
+from tests.factories.ball_model import ALL_ROUND, RADIUS, ball_scene, seen_surface
+from tests.factories.cameras import FRAME
+from tests.factories.models import WAVELENGTHS_NM, make_model
 from unmix_plugin.errors import ConfigError, RunError, SpectrumError
 from unmix_plugin.products.point_cloud import (
     _is_outlier,

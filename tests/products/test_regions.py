@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from tests.products.ball_model import RADIUS, SHADE, ball_scene, cameras_around
-from tests.products.ball_page import box
-from tests.trained.camera_scenes import FRAME
+from tests.factories.ball_model import RADIUS, SHADE, ball_scene, cameras_around
+from tests.factories.ball_page import box
+from tests.factories.cameras import FRAME
 from unmix_plugin.engine.runs.atomic_files import RUN_FORMAT
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.errors import ConfigError, RunError

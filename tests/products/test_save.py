@@ -10,8 +10,8 @@ import spectral.io.envi as envi
 import torch
 from PIL import Image
 
-from tests.method_factory import make_scene, with_a_sky
-from tests.products.render.render_factory import read_exr
+from tests.factories.models import make_scene, with_a_sky
+from tests.factories.renders import read_exr
 from unmix_plugin import save
 from unmix_plugin.errors import ConfigError, RunError
 

@@ -16,9 +16,9 @@ import torch
 from PIL import Image
 from torch.testing import assert_close
 
-from tests.method_factory import make_scene
-from tests.scenes import scene_factory
-from tests.trained.camera_scenes import FRAME, around
+from tests.factories import scenes
+from tests.factories.cameras import FRAME, around
+from tests.factories.models import make_scene
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import KeyPoses
 from unmix_plugin.engine.processes import ALONE
@@ -104,7 +104,7 @@ def test_cubes_say_of_which_view_their_numbers_are(tmp_path, product, said):
 
 
 def test_what_a_training_view_measured_is_as_exposed_as_the_trained_scene(tmp_path):
-    scene = load_scene(scene_factory.make_scene(tmp_path / "ball").root)
+    scene = load_scene(scenes.make_scene(tmp_path / "ball").root)
     gains = torch.rand(len(scene.train_indices), len(scene.wavelengths_nm)) + 0.5
     trained, measured = replace(make_scene(), view_gains=gains), MeasuredScene(scene, None)
     row, column = np.argwhere(scene.cube(0).sum(axis=-1) > 0)[0].tolist()

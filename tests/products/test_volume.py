@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from tests.method_factory import make_scene
-from tests.products.ball_model import INNER_RADIUS, RADIUS, ball_scene
-from tests.trained.camera_scenes import FRAME
+from tests.factories.ball_model import INNER_RADIUS, RADIUS, ball_scene
+from tests.factories.cameras import FRAME
+from tests.factories.models import make_scene
 from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.products.volume import _write_volume
 from unmix_plugin.trained.surface import GridPoints, sample_field

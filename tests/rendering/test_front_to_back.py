@@ -6,11 +6,11 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from tests.factories.scenes import make_scene
 from tests.poses.test_training import config_for, trained
 from tests.rendering.test_renderer import make, rays
 from tests.rendering.test_unbounded import make as make_unbounded
 from tests.rendering.test_unbounded import rays as rays_without_end
-from tests.scenes.scene_factory import make_scene
 from unmix_plugin.presets import WITH_ALPHA
 from unmix_plugin.rendering import front_to_back
 from unmix_plugin.rendering.front_to_back import composite

@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.method_factory import BOX, NUM_BANDS, make_model, make_rays, scene_of
+from tests.factories.models import BOX, NUM_BANDS, make_model, make_rays, scene_of
 from unmix_plugin.engine.runs.config_json import config_from_json, config_to_json
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.field import FieldSpace

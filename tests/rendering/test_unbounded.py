@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.method_factory import BOX, make_model, make_rays
+from tests.factories.models import BOX, make_model, make_rays
 from unmix_plugin.editing.edited_field import EditedField
 from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.engine.processes import Processes

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.scenes.scene_factory import SceneFolder, make_scene
+from tests.factories.scenes import SceneFolder, make_scene
 
 
 @pytest.fixture

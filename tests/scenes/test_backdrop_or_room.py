@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.captures.file_factory import present
-from tests.scenes.demo.demo_parts import one_ray_a_pixel
+from tests.factories.demo_parts import one_ray_a_pixel
+from tests.factories.files import present
 from unmix_plugin.engine.geometry.camera_paths import upright_cameras
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.scenes.backdrop_trial import measure_distance

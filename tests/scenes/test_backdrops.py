@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.captures.file_factory import present
-from tests.scenes.scene_factory import cameras_of
+from tests.factories.files import present
+from tests.factories.scenes import cameras_of
 from unmix_plugin.scenes.backdrops import Backdrop, find_before_backdrop, judge_backdrop
 from unmix_plugin.scenes.geometry.views import Views
 

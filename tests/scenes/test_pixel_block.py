@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 import torch
 
-from tests.captures.file_factory import present
-from tests.scenes.scene_factory import widen
+from tests.factories.files import present
+from tests.factories.scenes import widen
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes import pixel_block, pixel_table
 from unmix_plugin.scenes.pixel_block import PixelBlock

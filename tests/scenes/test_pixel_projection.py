@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.scenes.scene_factory import make_scene, widen
+from tests.factories.scenes import make_scene, widen
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.scenes import pixel_table
 from unmix_plugin.scenes.pixel_projection import ProjectedPixels, Projection

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 import torch
 
-from tests.captures.file_factory import present
-from tests.scenes.rig_factory import make_rig
+from tests.factories.files import present
+from tests.factories.scenes import make_rig
 from unmix_plugin.scenes import pixel_table
 from unmix_plugin.scenes.pixel_table import PixelTable
 from unmix_plugin.scenes.reading.loader import load_scene

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.testing import assert_close
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from tests.spectral.mixtures import seeded, smooth_endmembers
+from tests.factories.mixtures import seeded, smooth_endmembers
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral import metrics
 from unmix_plugin.spectral.metrics import (

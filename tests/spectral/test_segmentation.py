@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.testing import assert_close
 
-from tests.spectral.mixtures import seeded, smooth_endmembers
+from tests.factories.mixtures import seeded, smooth_endmembers
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.segmentation import SegmentationTally, material_ids, material_scores
 

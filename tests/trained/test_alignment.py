@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.method_factory import make_scene
+from tests.factories.models import make_scene
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import KeyPoses
 from unmix_plugin.poses.refinement import LARGEST_STEP

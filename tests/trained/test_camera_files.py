@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from tests.pose_factory import line_camera
-from tests.scenes.scene_factory import look_at
-from tests.trained.camera_scenes import FRAME, around
+from tests.factories.cameras import FRAME, around
+from tests.factories.refined_cameras import line_camera
+from tests.factories.scenes import look_at
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.trained.camera_files import camera_file_bytes, read_camera_file
 from unmix_plugin.trained.run_views import RunView

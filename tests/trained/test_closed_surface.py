@@ -7,8 +7,8 @@ import pytest
 import torch
 import trimesh
 
-from tests.products.ball_model import INNER_RADIUS, RADIUS, ball_scene
-from tests.trained.camera_scenes import around
+from tests.factories.ball_model import INNER_RADIUS, RADIUS, ball_scene
+from tests.factories.cameras import around
 from unmix_plugin.errors import RunError
 from unmix_plugin.trained import closed_surface as module
 from unmix_plugin.trained.closed_surface import closed_surface

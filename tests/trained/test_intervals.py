@@ -8,10 +8,10 @@ import pytest
 import torch
 import trimesh
 
-from tests.method_factory import NUM_BANDS
-from tests.products.ball_model import RADIUS, ball_scene
-from tests.products.ball_page import box
-from tests.trained.camera_scenes import FRAME
+from tests.factories.ball_model import RADIUS, ball_scene
+from tests.factories.ball_page import box
+from tests.factories.cameras import FRAME
+from tests.factories.models import NUM_BANDS
 from unmix_plugin.editing import Light, Recipe, edit_scene
 from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.scenes.demo.scene import make_demo_scene

@@ -6,8 +6,8 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 
-from tests.products.ball_model import RADIUS, ball_scene, cameras_around
-from tests.trained.camera_scenes import FRAME
+from tests.factories.ball_model import RADIUS, ball_scene, cameras_around
+from tests.factories.cameras import FRAME
 from unmix_plugin.engine.runs.atomic_files import RUN_FORMAT
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.errors import ConfigError, RunError

@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.method_factory import BOX, CAMERA, CONFIG, make_model, scene_of
-from tests.scenes.scene_factory import make_scene
+from tests.factories.models import BOX, CAMERA, CONFIG, make_model, scene_of
+from tests.factories.scenes import make_scene
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.errors import RunError, SceneError
 from unmix_plugin.scenes.reading.loader import load_scene

@@ -6,10 +6,10 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.engine.rgb_nerf_plugin import RgbNerf, RgbNerfConfig
-from tests.method_factory import CAMERA, NUM_BANDS, make_scene
-from tests.products.ball_model import RADIUS, ball_scene, cameras_around
-from tests.trained.camera_scenes import BOX, FRAME, around, record
+from tests.factories.ball_model import RADIUS, ball_scene, cameras_around
+from tests.factories.cameras import BOX, FRAME, around, record
+from tests.factories.models import CAMERA, NUM_BANDS, make_scene
+from tests.factories.rgb_nerf import RgbNerf, RgbNerfConfig
 from unmix_plugin.engine.outputs import Output
 from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.products.render.job import needs_survey, take_survey

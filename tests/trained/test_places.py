@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 import torch
 
-from tests.method_factory import BOX, NUM_BANDS
-from tests.products.ball_model import RADIUS, ball_scene
-from tests.trained.camera_scenes import FRAME
+from tests.factories.ball_model import RADIUS, ball_scene
+from tests.factories.cameras import FRAME
+from tests.factories.models import BOX, NUM_BANDS
 from unmix_plugin.editing import Light, Recipe, Remove, edit_scene
 from unmix_plugin.engine.processes import ALONE
 from unmix_plugin.engine.runs.load_run import SceneRecord

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from tests.method_factory import make_scene
-from tests.products.ball_model import RADIUS, SHADE, BallField, ball_scene, cameras_around
-from tests.trained.camera_scenes import FRAME, around
+from tests.factories.ball_model import RADIUS, SHADE, BallField, ball_scene, cameras_around
+from tests.factories.cameras import FRAME, around
+from tests.factories.models import make_scene
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.trained.trained_scene import one_pixel
 

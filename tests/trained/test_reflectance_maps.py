@@ -3,7 +3,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.method_factory import CAMERA, WAVELENGTHS_NM, make_scene
+from tests.factories.models import CAMERA, WAVELENGTHS_NM, make_scene
 from unmix_plugin.editing.apply import edit_scene
 from unmix_plugin.editing.recipe import Light, Recipe
 from unmix_plugin.errors import ConfigError, SpectrumError

@@ -6,8 +6,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.method_factory import make_scene
-from tests.trained.camera_scenes import FRAME, around, record
+from tests.factories.cameras import FRAME, around, record
+from tests.factories.models import make_scene
 from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.products.render import RenderOptions
 from unmix_plugin.products.render.cameras import choose_cameras

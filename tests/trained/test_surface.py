@@ -5,8 +5,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.products import ball_model
-from tests.scenes.scene_factory import cameras_of
+from tests.factories import ball_model
+from tests.factories.scenes import cameras_of
 from unmix_plugin.products.mesh import gltf_content
 from unmix_plugin.spectral.materials import Coefficients
 from unmix_plugin.trained.outputs import OUTPUTS

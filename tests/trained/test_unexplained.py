@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.method_factory import CAMERA, NUM_BANDS, make_scene
+from tests.factories.models import CAMERA, NUM_BANDS, make_scene
 from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.spectral.library.spectra_csv import read_spectra
 from unmix_plugin.trained.trained_scene import TrainedScene

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from tests.method_factory import make_model
-from tests.viewer.pages import opened, serving
-from tests.viewer.view_factory import make_source, source_of_model
-from tests.viewer_page import Page
+from tests.factories.models import make_model
+from tests.factories.viewer_page import Page
+from tests.factories.viewers import opened, serving
+from tests.factories.views import make_source, source_of_model
 from unmix_plugin.model import UnmixModel
 from unmix_plugin.viewer.rendering.scene import SceneSource
 from unmix_plugin.viewer.server import Viewer

@@ -11,11 +11,11 @@ import torch
 from PIL import Image
 from viser import SceneApi
 
-from tests.engine.rgb_nerf_plugin import RgbNerf, RgbNerfConfig
-from tests.method_factory import make_model
-from tests.products.render.render_factory import read_exr
-from tests.viewer.pages import decoded, has_control, opened, serving, show_layer
-from tests.viewer.view_factory import BOX, make_source, ring, source_of_model
+from tests.factories.models import make_model
+from tests.factories.renders import read_exr
+from tests.factories.rgb_nerf import RgbNerf, RgbNerfConfig
+from tests.factories.viewers import decoded, has_control, opened, serving, show_layer
+from tests.factories.views import BOX, make_source, ring, source_of_model
 from unmix_plugin.editing import Light, Recipe, Retint
 from unmix_plugin.engine.outputs import Output
 from unmix_plugin.engine.runs.load_run import SceneRecord

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.editing.scenes import CAMERAS, lit_scene
+from tests.factories.edited_scenes import CAMERAS, lit_scene
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.trained.measures import Scale

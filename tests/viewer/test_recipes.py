@@ -9,7 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.editing.scenes import lit_scene
+from tests.factories.edited_scenes import lit_scene
 from unmix_plugin.editing import (
     Gloss,
     Isolate,

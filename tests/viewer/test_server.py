@@ -19,8 +19,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from websockets.exceptions import InvalidStatus
 
-from tests.viewer.pages import has_control, opened, page_of, serving, show_layer
-from tests.viewer.view_factory import make_source
+from tests.factories.viewers import has_control, opened, page_of, serving, show_layer
+from tests.factories.views import make_source
 from unmix_plugin.engine.training.progress import TrainingStatus
 from unmix_plugin.engine.training.training_control import TrainingControl
 from unmix_plugin.errors import ConfigError
@@ -237,7 +237,7 @@ def test_a_page_of_another_site_is_refused_and_one_of_its_own_is_served(source):
 
 
 def test_a_page_of_another_version_is_refused(viewer, monkeypatch):
-    monkeypatch.setattr("tests.viewer_page.viser", SimpleNamespace(__version__="0.0.1"))
+    monkeypatch.setattr("tests.factories.viewer_page.viser", SimpleNamespace(__version__="0.0.1"))
     assert refused(viewer) == 400
 
 

@@ -4,8 +4,8 @@ import time
 
 import numpy as np
 
-from tests.viewer.pages import decoded, opened, page_of, show_layer
-from tests.viewer.view_factory import make_source, no_scene
+from tests.factories.viewers import decoded, opened, page_of, show_layer
+from tests.factories.views import make_source, no_scene
 from unmix_plugin.engine.training.progress import TrainingStatus
 from unmix_plugin.engine.training.training_control import TrainingControl
 from unmix_plugin.viewer.recipes import RecipeHistory

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.testing import assert_close
 
-from tests.viewer.view_factory import ring, some_pose
+from tests.factories.views import ring, some_pose
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.trained.run_views import up_direction

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.captures.file_factory import file_of
+from tests.factories.files import file_of
 from unmix_plugin.captures.calibration.calibration import Calibration, Raster
 from unmix_plugin.captures.calibration.references import (
     GivenReferences,

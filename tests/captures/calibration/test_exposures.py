@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.captures.capture_factory import (
+from tests.factories.captures import (
     BANDS,
     HEIGHT,
     WIDTH,
@@ -16,7 +16,7 @@ from tests.captures.capture_factory import (
     write_cube,
     write_poses,
 )
-from tests.captures.file_factory import exposure_of_file, file_of, present
+from tests.factories.files import exposure_of_file, file_of, present
 from unmix_plugin.captures.calibration.exposures import ExposedFiles, compare_exposures, exposure_of
 from unmix_plugin.captures.cube import Exposure, Linear, Meaning
 from unmix_plugin.captures.fields import state_exposure

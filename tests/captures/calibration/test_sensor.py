@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.captures.file_factory import exposure_of_file, file_of
 from tests.captures.test_camera_tags import EXIF, MICASENSE
+from tests.factories.files import exposure_of_file, file_of
 from unmix_plugin.captures.calibration.bands import (
     BandChoice,
     BandFault,

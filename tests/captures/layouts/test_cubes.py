@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.captures.capture_factory import HEIGHT, WIDTH, make_capture, process, write_cube, write_poses
-from tests.captures.layouts.data_sets import PLAIN
+from tests.factories.captures import HEIGHT, WIDTH, make_capture, process, write_cube, write_poses
+from tests.factories.data_sets import PLAIN
 from unmix_plugin.captures.layouts.cubes import find_cubes
 from unmix_plugin.captures.names import view_names
 from unmix_plugin.errors import CaptureError

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.captures.file_factory import check_file, present, rows_and_bands_of
-from tests.captures.layouts.data_sets import (
+from tests.factories.data_sets import (
     PLAIN,
     intensity,
     pose,
@@ -17,6 +16,7 @@ from tests.captures.layouts.data_sets import (
     write_nespof,
     write_real,
 )
+from tests.factories.files import check_file, present, rows_and_bands_of
 from unmix_plugin.captures.cube import ReadOptions
 from unmix_plugin.captures.layouts.transforms import (
     find_nespof,

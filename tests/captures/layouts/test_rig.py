@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.captures.capture_factory import process
-from tests.captures.file_factory import file_of, present, write_band_file
-from tests.captures.layouts.data_sets import PLAIN
-from tests.captures.layouts.rig_flight import (
+from tests.factories.captures import process
+from tests.factories.data_sets import PLAIN
+from tests.factories.files import file_of, present, write_band_file
+from tests.factories.poses import by_hand
+from tests.factories.rig_flight import (
     HEIGHT,
     LENSES,
     PANEL_LIGHT,
@@ -25,8 +26,7 @@ from tests.captures.layouts.rig_flight import (
     write_panel,
     write_poses,
 )
-from tests.captures.layouts.rig_flight import tags as tags_of
-from tests.captures.poses.pose_factory import by_hand
+from tests.factories.rig_flight import tags as tags_of
 from unmix_plugin.captures.cube import CameraTags, Cube, ReadOptions
 from unmix_plugin.captures.layouts.rig import find_rig, lens_of, split_shots
 from unmix_plugin.captures.names import natural_order

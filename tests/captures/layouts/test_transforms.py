@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.captures.capture_factory import process
-from tests.captures.file_factory import check_file, present, warnings_of, write_envi
-from tests.captures.layouts.data_sets import (
+from tests.factories.captures import process
+from tests.factories.data_sets import (
     LENS,
     PLAIN,
     cube,
@@ -25,6 +24,7 @@ from tests.captures.layouts.data_sets import (
     write_real,
     write_unmix,
 )
+from tests.factories.files import check_file, present, warnings_of, write_envi
 from unmix_plugin.captures.cube import ReadOptions
 from unmix_plugin.captures.layouts.transforms import find_nerfstudio, find_unmix_nerf
 from unmix_plugin.captures.options import LAYOUTS, find_views

@@ -4,8 +4,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.captures.file_factory import present
-from tests.captures.poses.pose_factory import FLIP, LENS, assert_same_poses, ring
+from tests.factories.files import present
+from tests.factories.poses import FLIP, LENS, assert_same_poses, ring
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.errors import CaptureError
 

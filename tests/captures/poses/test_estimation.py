@@ -6,10 +6,9 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import Rotation
 
-from tests.captures.file_factory import present
-from tests.captures.poses.alignment import align_poses, elsewhere
-from tests.captures.poses.pose_factory import ring_set
-from tests.scenes.scene_factory import look_at
+from tests.factories.files import present
+from tests.factories.poses import align_poses, elsewhere, ring_set
+from tests.factories.scenes import look_at
 from unmix_plugin.captures.poses import estimation
 from unmix_plugin.captures.poses.estimation import contrast_picture, estimate_poses
 from unmix_plugin.captures.poses.lens import Lens

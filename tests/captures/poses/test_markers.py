@@ -7,10 +7,10 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from tests.captures.file_factory import present
-from tests.captures.poses.alignment import align_poses, elsewhere
-from tests.commands.running import done, refused
-from tests.scenes.scene_factory import look_at
+from tests.factories.commands import done, refused
+from tests.factories.files import present
+from tests.factories.poses import align_poses, elsewhere
+from tests.factories.scenes import look_at
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.marker_detection import FAMILIES, count_markers, find_markers, parse_family
 from unmix_plugin.captures.poses.markers import metric_poses, poses_from_markers

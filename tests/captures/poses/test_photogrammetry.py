@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tests.captures.file_factory import present
-from tests.captures.poses.pose_factory import (
+from tests.factories.files import present
+from tests.factories.poses import (
     BROWN,
     CALIBRATION,
     FLIP,

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.captures.poses.pose_factory import ring_set
+from tests.factories.poses import ring_set
 from unmix_plugin.captures.names import match_poses
 from unmix_plugin.captures.poses.pose_set import PoseSet
 from unmix_plugin.captures.report import Code, Kind, sentences

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.captures.file_factory import present
-from tests.captures.poses.pose_factory import (
+from tests.factories.files import present
+from tests.factories.poses import (
     FLIP,
     IDEAL,
     LENS,

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import binary_dilation
 
-from tests.captures.poses.alignment import align_poses
-from tests.scenes.scene_factory import look_at
+from tests.factories.poses import align_poses
+from tests.factories.scenes import look_at
 from unmix_plugin.captures.poses import turntable as turntable_module
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet

@@ -11,7 +11,7 @@ import scipy.io
 import scipy.sparse
 import torch
 
-from tests.captures.file_factory import (
+from tests.factories.files import (
     ARRAY_WRITERS,
     check_file,
     notes_of,

@@ -9,7 +9,7 @@ import pytest
 import spectral.io.envi as spy
 import tifffile
 
-from tests.captures.file_factory import AXES, check_file, header_text, present, rows_and_bands_of, write_envi
+from tests.factories.files import AXES, check_file, header_text, present, rows_and_bands_of, write_envi
 from unmix_plugin.captures.cube import ReadOptions
 from unmix_plugin.captures.layouts.cubes import find_cubes
 from unmix_plugin.captures.readers.opening import open_spectral_file

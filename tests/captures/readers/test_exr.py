@@ -4,7 +4,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from tests.captures.file_factory import check_file, rows_and_bands_of
+from tests.factories.files import check_file, rows_and_bands_of
 from unmix_plugin.captures.calibration.references import stated_reflectance
 from unmix_plugin.captures.cube import ReadOptions
 from unmix_plugin.captures.readers.opening import open_spectral_file

@@ -19,9 +19,9 @@ import pytest
 import tifffile
 from PIL import Image
 
-from tests.captures.file_factory import header_text
-from tests.captures.layouts.data_sets import write_exr
-from tests.systems import most_memory
+from tests.factories.data_sets import write_exr
+from tests.factories.files import header_text
+from tests.factories.systems import most_memory
 from unmix_plugin import limits
 from unmix_plugin.captures.readers.opening import inspect_file, open_spectral_file
 from unmix_plugin.errors import CaptureError

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import tifffile
 
-from tests.captures.file_factory import check_file, gdal_items, gdal_tag, header_text, present, write_envi
-from tests.captures.poses.pose_factory import llff_table, ring, transforms, write_json
+from tests.factories.files import check_file, gdal_items, gdal_tag, header_text, present, write_envi
+from tests.factories.poses import llff_table, ring, transforms, write_json
 from tests.fuzz.capture_samples import SAMPLES
 from unmix_plugin.captures.calibration.references import finished_by, stated_reflectance
 from unmix_plugin.captures.readers.opening import inspect_file, open_spectral_file

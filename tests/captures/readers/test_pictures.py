@@ -6,7 +6,8 @@ import pytest
 import tifffile
 from PIL import Image
 
-from tests.captures.file_factory import (
+from tests.captures.test_camera_tags import EXIF, MICASENSE
+from tests.factories.files import (
     check_file,
     header_text,
     present,
@@ -14,7 +15,6 @@ from tests.captures.file_factory import (
     warnings_of,
     write_band_file,
 )
-from tests.captures.test_camera_tags import EXIF, MICASENSE
 from unmix_plugin.captures.calibration.references import find_missing, finished_by
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.errors import CaptureError

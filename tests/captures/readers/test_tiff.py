@@ -9,7 +9,7 @@ import pytest
 import tifffile
 from PIL import Image
 
-from tests.captures.file_factory import (
+from tests.factories.files import (
     check_file,
     gdal_items,
     gdal_tag,

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.captures.capture_factory import process, write_cube, write_poses
-from tests.captures.file_factory import file_of
+from tests.factories.captures import process, write_cube, write_poses
+from tests.factories.files import file_of
 from unmix_plugin.captures.calibration.calibration import CalibratedRows, Calibration, Raster
 from unmix_plugin.captures.poses.lens import Lens, Points, distort_fisheye, distort_ftheta, fit_lens
 from unmix_plugin.captures.writing.resampling import Resampling

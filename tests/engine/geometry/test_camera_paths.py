@@ -7,9 +7,9 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.scenes.geometry.ground_views import flight_poses
-from tests.scenes.scene_factory import look_at, ring_poses
-from tests.trained.camera_scenes import BOX, around, cameras_at, in_front
+from tests.factories.cameras import BOX, around, cameras_at, in_front
+from tests.factories.ground_views import flight_poses
+from tests.factories.scenes import look_at, ring_poses
 from unmix_plugin.engine.geometry.camera_paths import (
     focus_point,
     interpolated,

@@ -15,7 +15,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.systems import needs_posix
+from tests.factories.systems import needs_posix
 from unmix_plugin.engine.runs import atomic_files
 from unmix_plugin.engine.runs.checkpoints import newest_complete_checkpoint, save_checkpoint
 from unmix_plugin.engine.runs.run_folder import checkpoint_steps

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.engine.rgb_nerf_plugin import rgb_nerf
+from tests.factories.rgb_nerf import rgb_nerf
 from unmix_plugin.engine.configs import InstantiateConfig, OptimizerConfig, Target, TrainerConfig
 from unmix_plugin.engine.runs.config_json import config_from_json, config_to_json
 from unmix_plugin.errors import ConfigError

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 import torch
 
-from tests.engine.rgb_nerf_plugin import RgbNerfConfig
-from tests.engine.stopped_runs import quiet_trainer
+from tests.factories.rgb_nerf import RgbNerfConfig
+from tests.factories.trainings import quiet_trainer
 from unmix_plugin.engine.runs.atomic_files import RUN_FORMAT, whole_file, write_file, write_run_json
 from unmix_plugin.engine.runs.checkpoints import save_checkpoint
 from unmix_plugin.engine.runs.load_run import load_config, load_model, load_pipeline
@@ -160,9 +160,7 @@ class ReadAsAnother(RgbNerfConfig):
 def test_what_a_run_could_not_be_opened_with_is_refused_before_it_is_trained(
     short_config, monkeypatch, part, value, words
 ):
-    monkeypatch.setattr(
-        f"tests.engine.rgb_nerf_plugin.BallDataManager.{part}", lambda _: value, raising=False
-    )
+    monkeypatch.setattr(f"tests.factories.rgb_nerf.BallDataManager.{part}", lambda _: value, raising=False)
     model = value if part == "model" else short_config.pipeline.model
     with pytest.raises(UnmixError, match=words):
         Trainer(replace(short_config, pipeline=replace(short_config.pipeline, model=model)))
@@ -180,7 +178,7 @@ def test_nothing_is_written_when_the_scene_or_a_setting_is_refused(short_config,
         raise SceneError("no such scene")
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("tests.engine.rgb_nerf_plugin.BallDataManager.__init__", refuse)
+        patch.setattr("tests.factories.rgb_nerf.BallDataManager.__init__", refuse)
         with pytest.raises(SceneError):
             Trainer(short_config)
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)

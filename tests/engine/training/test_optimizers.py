@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 from torch import nn
 
-from tests.engine.stopped_runs import quiet_trainer
+from tests.factories.trainings import quiet_trainer
 from unmix_plugin.commands.training import finish
 from unmix_plugin.engine.configs import OptimizerConfig, TrainerConfig
 from unmix_plugin.engine.model import TrainingCallback, TrainingCallbackLocation

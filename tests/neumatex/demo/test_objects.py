@@ -9,7 +9,7 @@ import torch
 import trimesh
 from torch.testing import assert_close
 
-from tests.neumatex.surfaces import generator
+from tests.factories.surfaces import generator
 from tools.procedural_objects import SHAPES, seeded_lights, seeded_mesh, seeded_surface
 from unmix_plugin.neumatex.demo import objects
 from unmix_plugin.neumatex.demo.objects import demo_object_path, viewpoints

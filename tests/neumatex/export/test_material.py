@@ -8,9 +8,9 @@ import pytest
 import torch
 from PIL import Image
 
-from tests.neumatex.surfaces import LAYERED, PBR, TURN, ball, eye_directions, generator, knot
-from tests.products.mesh_reading import loaded_mesh
-from tests.systems import needs_xatlas
+from tests.factories.outputs import loaded_mesh
+from tests.factories.surfaces import LAYERED, PBR, TURN, ball, eye_directions, generator, knot
+from tests.factories.systems import needs_xatlas
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.neumatex.export import pbr_fit
 from unmix_plugin.neumatex.export.material import material_paths, write_material

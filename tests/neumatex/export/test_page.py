@@ -5,10 +5,9 @@ import pytest
 import torch
 import trimesh
 
-from tests.commands.browser import CHROMIUM, FLAGS, HAS_BROWSER, SOFTWARE_GL
-from tests.commands.running import done
-from tests.neumatex.factory import trained_on, write_object, write_spectral_object
-from tests.neumatex.surfaces import ball, mesh_from
+from tests.factories.commands import CHROMIUM, FLAGS, HAS_BROWSER, SOFTWARE_GL, done
+from tests.factories.objects import trained_on, write_object, write_spectral_object
+from tests.factories.surfaces import ball, mesh_from
 from unmix_plugin.commands.export import export
 from unmix_plugin.neumatex.export import page
 from unmix_plugin.neumatex.tracing.environment import Environment

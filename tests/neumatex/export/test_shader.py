@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from tests.commands.browser import CHROMIUM, FLAGS
-from tests.neumatex.surfaces import eye_directions, generator, numbers
+from tests.factories.commands import CHROMIUM, FLAGS
+from tests.factories.surfaces import eye_directions, generator, numbers
 from unmix_plugin.neumatex.export.shader import shader_paths, write_shader
 from unmix_plugin.neumatex.tracing.layers import ggx_albedo, mean_ggx_albedo
 from unmix_plugin.neumatex.tracing.neural import Decoder, NeuralFamily

@@ -12,9 +12,9 @@ import trimesh
 from numpy.testing import assert_allclose
 from PIL import Image
 
-from tests.neumatex import factory
-from tests.neumatex.factory import CENTRE, COLOUR, ENDMEMBERS, LAMP, RADIUS, SIZE, WAVELENGTHS
-from tests.neumatex.surfaces import TURN, mesh_from
+from tests.factories import objects
+from tests.factories.objects import CENTRE, COLOUR, ENDMEMBERS, LAMP, RADIUS, SIZE, WAVELENGTHS
+from tests.factories.surfaces import TURN, mesh_from
 from unmix_plugin.errors import UnmixError
 from unmix_plugin.formats.exr import write_exr, write_spectral_exr
 from unmix_plugin.neumatex.fit.data_manager import ObjectDataManager, ObjectDataManagerConfig, PixelList
@@ -30,7 +30,7 @@ DIM = "relit/dim"
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    return factory.write_object(tmp_path_factory.mktemp("object") / "ball")
+    return objects.write_object(tmp_path_factory.mktemp("object") / "ball")
 
 
 @pytest.fixture
@@ -40,7 +40,7 @@ def folder(made, tmp_path):
 
 @pytest.fixture(scope="module")
 def made_spectral(tmp_path_factory):
-    return factory.write_spectral_object(tmp_path_factory.mktemp("object") / "ball")
+    return objects.write_spectral_object(tmp_path_factory.mktemp("object") / "ball")
 
 
 @pytest.fixture
@@ -173,7 +173,7 @@ def test_without_alpha_it_is_said_that_the_meshs_place_is_not_known_to_be_right(
 
 
 def test_tone_turn_exposure_and_metres_are_the_folders(tmp_path):
-    folder = factory.write_object(tmp_path / "ball", suffix=".png")
+    folder = objects.write_object(tmp_path / "ball", suffix=".png")
     assert load_object(folder).pictures.tone == "camera"
     _change(folder, tone_mapping="agx", environment_rotation_deg=90, environment_exposure_stops=1)
     _change(folder, metres_per_unit=0.001)
@@ -202,11 +202,11 @@ def test_a_mesh_of_another_size_is_said_to_fit_badly(made, folder):
 def test_pictures_and_light_of_different_units_are_told_and_mere_shade_is_not(made, folder):
     assert not _notes(made, "units")
     for sky, stops in ((1e4, "-13"), (1e-3, "10")):
-        factory.write_light(folder, sky=sky)
+        objects.write_light(folder, sky=sky)
         assert len(_notes(folder, "different units", f"'environment_exposure_stops' {stops} higher")) == 1
-    factory.write_light(folder, sky=1.0)
+    objects.write_light(folder, sky=1.0)
     for path in (folder / "images").glob("[!.]*"):
-        factory.write_picture(path, COLOUR, lit_rows=SIZE // 2 - 4)
+        objects.write_picture(path, COLOUR, lit_rows=SIZE // 2 - 4)
     assert not _notes(folder, "units")
 
 
@@ -290,7 +290,7 @@ def _move_mesh_out(folder):
 
 
 def _mixed_pictures(folder):
-    factory.write_picture(folder / "images" / "png.png", COLOUR)
+    objects.write_picture(folder / "images" / "png.png", COLOUR)
     _change_frames(folder, 3, file_path="images/png.png")
 
 
@@ -299,7 +299,7 @@ def _without(name):
 
 
 def _other_light(folder, **keys):
-    factory.write_cubes(folder / DIM, 2, 0.5, **keys)
+    objects.write_cubes(folder / DIM, 2, 0.5, **keys)
 
 
 BANDS_AS_COLOURS = {f"S0.{nm},0nm": 1.0 for nm in (450, 550, 650)}
@@ -311,7 +311,7 @@ FAULTS = [
     ),
     (partial(_truth, size=SIZE, names="PQRST"), "24, 5.; expected"),
     (
-        lambda folder: factory.write_views(folder / DIM, ".png", COLOUR, count=2),
+        lambda folder: objects.write_views(folder / DIM, ".png", COLOUR, count=2),
         "is camera, a response that is learnt from .* but those are linear; expected linear, srgb or agx",
     ),
     (partial(_other_light, wavelengths=None), "dim: pictures of 5 bands; the object has 3 colours"),
@@ -330,7 +330,7 @@ FAULTS = [
     (_second_mesh, r"has several: a.ply, b.ply; name one with 'mesh_path'"),
     (_move_mesh_out, r"leaves the scene folder; copy the file into it$"),  # no setting, for there is none
     (_without("environment.exr"), "no environment; put environment.exr"),
-    (partial(factory.write_light, sky=np.nan), "environment.exr: negative values, NaN"),
+    (partial(objects.write_light, sky=np.nan), "environment.exr: negative values, NaN"),
     (partial(_change_frames, **NO_POSE), r"frames\[3\]: 'transform_matrix' is absent"),
     (
         partial(_change_frames, **NO_POSE, row_poses=[np.eye(4).tolist()] * 5),
@@ -340,11 +340,11 @@ FAULTS = [
     (partial(_change, tone_mapping="filmic"), "'tone_mapping' is \"filmic\""),
     (partial(_change, environment_rotation_deg="north"), "environment_rotation_deg"),
     (
-        lambda folder: factory.write_picture(folder / "images/001.exr", (-1.0, 0.0, 0.0)),
+        lambda folder: objects.write_picture(folder / "images/001.exr", (-1.0, 0.0, 0.0)),
         "001.exr: negative values, NaN or infinity in .* pixels?,",
     ),
     (_mixed_pictures, "mix pictures of light"),
-    (lambda folder: factory.write_light(folder / DIM, sky=0.0), "relit/dim/environment.exr"),
+    (lambda folder: objects.write_light(folder / DIM, sky=0.0), "relit/dim/environment.exr"),
 ]
 
 
@@ -369,7 +369,7 @@ def test_light_and_materials_of_a_spectral_object_are_read(made_spectral):
 
 
 def test_a_held_out_light_may_have_its_own_lamp_and_an_option_replaces_the_objects(spectral_folder):
-    factory.write_table(spectral_folder / DIM / "lamp.csv", ("power",), LAMP[None, ::-1])
+    objects.write_table(spectral_folder / DIM / "lamp.csv", ("power",), LAMP[None, ::-1])
     _change(spectral_folder / DIM, illuminant_path="lamp.csv")
     [light] = load_object(spectral_folder).lights
     assert_allclose(light.environment.image[0, 0], 0.5 * LAMP[::-1], rtol=1e-6)
@@ -425,7 +425,7 @@ def _bands_per_frame(folder, bands):
 
 
 def _own_responses(folder):
-    factory.write_table(folder / "responses.csv", ("a", "b", "c", "d", "e"), np.eye(5)[::-1])
+    objects.write_table(folder / "responses.csv", ("a", "b", "c", "d", "e"), np.eye(5)[::-1])
     _change_frames(folder, responses_path="responses.csv")
 
 

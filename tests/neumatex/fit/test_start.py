@@ -8,9 +8,9 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.neumatex.factory import SIZE, pose, write_object
-from tests.neumatex.surfaces import generator, unit
-from tests.products.ball_model import RADIUS, ball_scene
+from tests.factories.ball_model import RADIUS, ball_scene
+from tests.factories.objects import SIZE, pose, write_object
+from tests.factories.surfaces import generator, unit
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.neumatex.fit import data_manager
 from unmix_plugin.neumatex.fit.data_manager import view_arrays

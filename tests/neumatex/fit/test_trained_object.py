@@ -8,7 +8,7 @@ import torch
 from numpy.testing import assert_allclose
 from torch.testing import assert_close
 
-from tests.neumatex.surfaces import CAMERAS, FRAME, PBR, TURN, make_object, uneven_light
+from tests.factories.surfaces import CAMERAS, FRAME, PBR, TURN, make_object, uneven_light
 from unmix_plugin.errors import ConfigError, SceneError
 from unmix_plugin.formats.exr import write_exr
 from unmix_plugin.neumatex.fit.trained_object import OWN_LIGHT

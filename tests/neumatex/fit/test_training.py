@@ -11,12 +11,11 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.commands.running import done, picture_size, refused, run
-from tests.neumatex import factory
-from tests.neumatex.factory import SMALL, trained_on, write_light, write_object, write_spectral_object
-from tests.neumatex.surfaces import generator, unit
-from tests.products import ball_model
-from tests.systems import needs_xatlas
+from tests.factories import ball_model, objects
+from tests.factories.commands import done, picture_size, refused, run
+from tests.factories.objects import SMALL, trained_on, write_light, write_object, write_spectral_object
+from tests.factories.surfaces import generator, unit
+from tests.factories.systems import needs_xatlas
 from unmix_plugin.commands.eval import evaluate
 from unmix_plugin.commands.export import export
 from unmix_plugin.commands.render import render
@@ -244,7 +243,7 @@ def test_the_viewer_paints_abundances_as_a_mixture_of_the_colours_of_the_segment
 def test_another_light_in_colours_gets_the_lamps_spectrum(scene):
     relit = scene.with_light(LightChoice("overcast", 0.0, 0.0))
     spectrum = relit.environment.image[3, 5].double().numpy()
-    np.testing.assert_allclose(spectrum / spectrum.max(), factory.LAMP, rtol=1e-5)
+    np.testing.assert_allclose(spectrum / spectrum.max(), objects.LAMP, rtol=1e-5)
     back = relit.with_light(LightChoice(None, 0.0, 0.0))
     assert torch.equal(back.environment.image, scene.environment.image)
 
@@ -256,7 +255,7 @@ def test_the_export_has_abundance_textures_and_endmembers(spectral):
     table = read_spectra(folder / "endmembers.csv")
     assert all(name.endswith((" 1", " 2")) for name in table.names)
     found = table.spectra / np.linalg.norm(table.spectra, axis=1, keepdims=True)
-    true = factory.ENDMEMBERS / np.linalg.norm(factory.ENDMEMBERS, axis=1, keepdims=True)
+    true = objects.ENDMEMBERS / np.linalg.norm(objects.ENDMEMBERS, axis=1, keepdims=True)
     assert np.sort((found @ true.T).max(axis=1)).min() > 0.98
     channels = OpenEXR.File(str(folder / "abundances.exr"), separate_channels=True).channels()
     total = np.sum([channel.pixels for channel in channels.values()], axis=0)
@@ -272,7 +271,7 @@ def test_the_number_of_materials_is_proposed_where_it_is_asked_for(tmp_path):
 
 
 def test_a_fit_starts_from_the_endmembers_and_abundances_of_a_run(tmp_path, monkeypatch):
-    there = Normalisation(np.eye(3), -factory.CENTRE, ball_model.RADIUS / factory.RADIUS)
+    there = Normalisation(np.eye(3), -objects.CENTRE, ball_model.RADIUS / objects.RADIUS)
     of_run = replace(ball_model.ball_scene(), frame=there)
     monkeypatch.setattr(start, "opened_run", lambda _: of_run)
     folder = write_spectral_object(tmp_path / "ball")

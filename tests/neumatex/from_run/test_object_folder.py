@@ -8,8 +8,8 @@ import pytest
 import torch
 import trimesh
 
-from tests.commands.running import done, refused, run_of
-from tests.neumatex.factory import (
+from tests.factories.commands import done, refused, run_of
+from tests.factories.objects import (
     CENTRE,
     LAMP,
     RADIUS,

@@ -8,7 +8,7 @@ import torch
 import trimesh
 from torch.testing import assert_close
 
-from tests.neumatex.surfaces import ball, generator, mesh_from, unit
+from tests.factories.surfaces import ball, generator, mesh_from, unit
 from tools import prior_objects, train_prior
 from unmix_plugin.errors import RunError, SceneError
 from unmix_plugin.neumatex.demo.objects import viewpoints

@@ -9,7 +9,7 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch.testing import assert_close
 
-from tests.neumatex.surfaces import generator
+from tests.factories.surfaces import generator
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.neumatex.prior.wan import WanPrior, read_wan_prior
 from unmix_plugin.neumatex.tracing.surface import Triplane

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.neumatex.surfaces import (
+from tests.factories.surfaces import (
     Uniform,
     ball,
     eye_directions,

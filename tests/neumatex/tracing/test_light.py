@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.neumatex.surfaces import generator, unit
+from tests.factories.surfaces import generator, unit
 from unmix_plugin.errors import SceneError, SpectrumError
 from unmix_plugin.formats.exr import write_exr, write_spectral_exr
 from unmix_plugin.neumatex.tracing.built_in_lights import NAMES, built_in_environment

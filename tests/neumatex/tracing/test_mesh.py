@@ -11,8 +11,8 @@ import torch
 import trimesh
 from torch.testing import assert_close
 
-from tests.neumatex.surfaces import ball, generator, knot, unit
-from tests.systems import needs_posix
+from tests.factories.surfaces import ball, generator, knot, unit
+from tests.factories.systems import needs_posix
 from unmix_plugin.errors import SceneError
 from unmix_plugin.formats.meshes import write_glb
 from unmix_plugin.neumatex.tracing import mesh as reading

@@ -10,7 +10,7 @@ import safetensors.torch
 import torch
 from torch.testing import assert_close
 
-from tests.neumatex.surfaces import eye_directions, numbers
+from tests.factories.surfaces import eye_directions, numbers
 from tools.train_decoder import DecoderTraining, draw_materials, response_error, train, write_weights
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.neumatex.tracing.families import LayeredFamily

@@ -7,7 +7,7 @@ import torch
 import trimesh
 from torch.testing import assert_close
 
-from tests.neumatex.surfaces import Glossy, Lambert, Uniform, ball, generator, mesh_from, unit
+from tests.factories.surfaces import Glossy, Lambert, Uniform, ball, generator, mesh_from, unit
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.neumatex.tracing.built_in_lights import built_in_environment
 from unmix_plugin.neumatex.tracing.environment import Environment, directions_of_pixels

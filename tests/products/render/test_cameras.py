@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import pytest
 
-from tests.method_factory import make_scene
-from tests.scenes.scene_factory import ring_poses
-from tests.trained.camera_scenes import around, cameras_at, record
+from tests.factories.cameras import around, cameras_at, record
+from tests.factories.models import make_scene
+from tests.factories.scenes import ring_poses
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.products.render import RenderOptions
 from unmix_plugin.products.render.cameras import choose_cameras

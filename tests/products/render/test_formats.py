@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from tests.method_factory import WAVELENGTHS_NM, make_scene
+from tests.factories.models import WAVELENGTHS_NM, make_scene
 from unmix_plugin.engine.outputs import Output
 from unmix_plugin.errors import UnmixError
 from unmix_plugin.products.render.files import choose_formats, file_name

@@ -8,10 +8,10 @@ import pytest
 from matplotlib import colormaps
 from PIL import Image
 
-from tests.formats.cubes import full_disk
-from tests.formats.video_reading import read_video
-from tests.pose_factory import line_camera
-from tests.products.render.render_factory import SCENE, read_envi, read_exr, render, truth, views
+from tests.factories.cubes import full_disk
+from tests.factories.outputs import read_video
+from tests.factories.refined_cameras import line_camera
+from tests.factories.renders import SCENE, read_envi, read_exr, render, truth, views
 from unmix_plugin.errors import RunError
 from unmix_plugin.figures.pictures import CanvasLayout
 from unmix_plugin.products.render.cameras import RenderCameras

@@ -10,7 +10,7 @@ import pytest
 import spectral.io.envi as envi
 import tifffile
 
-from tests.products.ball_model import RADIUS, SHADE, ball_scene, lamplit_ball_scene
+from tests.factories.ball_model import RADIUS, SHADE, ball_scene, lamplit_ball_scene
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.products.render import RenderOptions, files
 from unmix_plugin.products.render.cameras import choose_cameras

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from tests.formats.video_reading import read_video
-from tests.products.render.render_factory import read_envi, read_exr, views
+from tests.factories.outputs import read_video
+from tests.factories.renders import read_envi, read_exr, views
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.engine.outputs import WORLD_UNITS, Output
 from unmix_plugin.errors import ConfigError

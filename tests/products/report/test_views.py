@@ -11,7 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
-from tests.products.report.page_outline import Outline, assert_self_contained
+from tests.factories.pages import Outline, assert_self_contained
 from unmix_plugin.figures.look import NEUTRAL
 from unmix_plugin.formats.files import eight_bits
 from unmix_plugin.products.report.pictures import (

@@ -6,7 +6,7 @@ import pytest
 from numpy.testing import assert_allclose
 from PIL import Image
 
-from tests.scenes.demo.demo_parts import LAMP, PLACEMENTS, one_ray_a_pixel
+from tests.factories.demo_parts import LAMP, PLACEMENTS, one_ray_a_pixel
 from unmix_plugin.errors import ConfigError, SceneError, SpectrumError
 from unmix_plugin.scenes.demo import scene as demo_scene
 from unmix_plugin.scenes.demo.shading import MATERIALS, _trace, band_centers_nm, lamp_power, reflectances

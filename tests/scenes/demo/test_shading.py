@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from tests.scenes.demo.demo_parts import APPLE, LAMP, PLACEMENTS, row
+from tests.factories.demo_parts import APPLE, LAMP, PLACEMENTS, row
 from unmix_plugin.scenes.demo import shading
 from unmix_plugin.scenes.demo.scene import demo_cameras
 

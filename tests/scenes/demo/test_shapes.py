@@ -4,7 +4,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from tests.scenes.demo.demo_parts import PLACEMENTS, row
+from tests.factories.demo_parts import PLACEMENTS, row
 from unmix_plugin.scenes.demo.shapes import PlacedPrimitive, first_hits
 
 coordinates = st.floats(-0.9, 0.9)

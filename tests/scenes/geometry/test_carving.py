@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from tests.scenes.geometry.ball_views import BOX, FOCAL, SIDE, ball_matter, make_cameras
-from tests.scenes.scene_factory import ball_alpha, cameras_of, look_at, make_scene, ring_poses, set_frame
+from tests.factories.ball_views import BOX, FOCAL, SIDE, ball_matter, make_cameras
+from tests.factories.scenes import ball_alpha, cameras_of, look_at, make_scene, ring_poses, set_frame
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import rotation_matrix
 from unmix_plugin.scenes.demo.scene import make_demo_scene

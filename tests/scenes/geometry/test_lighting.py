@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 import torch
 
-from tests.scenes.geometry.ball_views import BOX, RADIUS, SIDE, ball_matter, ball_views, make_cameras
-from tests.scenes.scene_factory import ring_poses
+from tests.factories.ball_views import BOX, RADIUS, SIDE, ball_matter, ball_views, make_cameras
+from tests.factories.scenes import ring_poses
 from unmix_plugin.scenes.geometry.carving import carve_box
 from unmix_plugin.scenes.geometry.lighting import _view_gains, judge_light
 

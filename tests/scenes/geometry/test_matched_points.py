@@ -5,8 +5,8 @@ import pytest
 import torch
 from PIL import Image
 
-from tests.captures.file_factory import present
-from tests.scenes.geometry.ground_views import (
+from tests.factories.files import present
+from tests.factories.ground_views import (
     FOCAL,
     HEIGHT,
     SLOPE,

@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 import torch
 
-from tests.captures.file_factory import present
-from tests.scenes.demo.demo_parts import one_ray_a_pixel
-from tests.scenes.geometry.ball_views import make_cameras
-from tests.scenes.scene_factory import look_at
+from tests.factories.ball_views import make_cameras
+from tests.factories.demo_parts import one_ray_a_pixel
+from tests.factories.files import present
+from tests.factories.scenes import look_at
 from unmix_plugin.engine.geometry.space import SceneBox, UnitSpace
 from unmix_plugin.scenes.demo.scene import PLACES, make_demo_scene
 from unmix_plugin.scenes.demo.shapes import first_hits

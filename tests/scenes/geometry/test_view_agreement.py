@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from tests.method_factory import CAMERA
-from tests.scenes.scene_factory import look_at, make_scene
+from tests.factories.models import CAMERA
+from tests.factories.scenes import look_at, make_scene
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes.demo.scene import make_demo_scene

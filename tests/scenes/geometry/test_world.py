@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from tests.scenes.demo.demo_parts import one_ray_a_pixel
-from tests.scenes.geometry.ball_views import make_cameras
-from tests.scenes.scene_factory import look_at
+from tests.factories.ball_views import make_cameras
+from tests.factories.demo_parts import one_ray_a_pixel
+from tests.factories.scenes import look_at
 from unmix_plugin.engine.geometry.space import SceneBox, UnitSpace
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes.demo.scene import PLACES, make_demo_scene

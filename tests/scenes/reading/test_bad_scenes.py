@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.scenes.scene_factory import HEIGHT, WIDTH, fault_of, set_frame
-from tests.systems import needs_posix
+from tests.factories.scenes import HEIGHT, WIDTH, fault_of, set_frame
+from tests.factories.systems import needs_posix
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes.reading.faults import MAX_LISTED, Faults
 from unmix_plugin.scenes.reading.images import UnreadableImageError, read_colour

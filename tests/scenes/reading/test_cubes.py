@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from tests.scenes.scene_factory import fault_of
+from tests.factories.scenes import fault_of
 from unmix_plugin.scenes.reading import cubes as arrays
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.settings import SceneOptions

@@ -5,8 +5,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.scenes.line_factory import make_line_scene, row_poses
-from tests.scenes.scene_factory import HEIGHT, fault_of, ring_poses, set_frame
+from tests.factories.scenes import HEIGHT, fault_of, make_line_scene, ring_poses, row_poses, set_frame
 from unmix_plugin.scenes.geometry.carving import carve
 from unmix_plugin.scenes.reading.loader import load_scene
 

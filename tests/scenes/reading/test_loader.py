@@ -10,8 +10,8 @@ import torch
 from numpy.testing import assert_allclose
 from PIL import Image
 
-from tests.captures.file_factory import present
-from tests.scenes.scene_factory import (
+from tests.factories.files import present
+from tests.factories.scenes import (
     FOCAL,
     HEIGHT,
     SPECTRUM,

@@ -3,9 +3,8 @@ import json
 import numpy as np
 import pytest
 
-from tests.captures.file_factory import present
-from tests.scenes.rig_factory import RESPONSES, halve, make_rig
-from tests.scenes.scene_factory import fault_of, set_frame
+from tests.factories.files import present
+from tests.factories.scenes import RESPONSES, fault_of, halve, make_rig, set_frame
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.scenes.scene import check_recorded_scene, scene_identity
 from unmix_plugin.spectral.sensor import SceneSensor

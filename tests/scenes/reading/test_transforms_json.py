@@ -6,8 +6,8 @@ from itertools import product
 import numpy as np
 import pytest
 
-from tests.captures.file_factory import present
-from tests.scenes.scene_factory import fault_of, make_scene
+from tests.factories.files import present
+from tests.factories.scenes import fault_of, make_scene
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes.frame_cameras import read_lens
 from unmix_plugin.scenes.reading.faults import Faults

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from tests.spectral.mixtures import seeded, smooth_endmembers
+from tests.factories.mixtures import seeded, smooth_endmembers
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.unmixing import abundances as sparse_unmixing
 from unmix_plugin.spectral.unmixing.abundances import fcls, nnls, sparse_abundances

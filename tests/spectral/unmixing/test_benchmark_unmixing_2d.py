@@ -8,7 +8,7 @@ import pytest
 import torch
 from scipy.io import savemat
 
-from tests.spectral.mixtures import seeded, smooth_endmembers
+from tests.factories.mixtures import seeded, smooth_endmembers
 
 SCRIPT = Path(__file__).parents[3] / "benchmarks" / "unmixing_2d.py"
 

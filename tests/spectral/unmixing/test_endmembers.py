@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.testing import assert_close
 
-from tests.spectral.mixtures import mixed_pixels, seeded, smooth_endmembers
+from tests.factories.mixtures import mixed_pixels, seeded, smooth_endmembers
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.metrics import spectral_angle
 from unmix_plugin.spectral.unmixing import endmembers

@@ -6,7 +6,7 @@ import pytest
 import spectral.io.envi as envi
 import torch
 
-from tests.spectral.mixtures import mixed_pixels, seeded, smooth_endmembers
+from tests.factories.mixtures import mixed_pixels, seeded, smooth_endmembers
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.metrics import spectral_angle
 from unmix_plugin.spectral.unmixing.image import unmix_image

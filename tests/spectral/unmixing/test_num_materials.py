@@ -4,7 +4,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.spectral.mixtures import mixed_pixels, seeded, smooth_endmembers, surface_pixels
+from tests.factories.mixtures import mixed_pixels, seeded, smooth_endmembers, surface_pixels
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.noise import estimate_noise
 from unmix_plugin.spectral.unmixing.num_materials import _elbow, hysime, propose_num_materials

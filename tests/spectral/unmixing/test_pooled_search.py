@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.spectral.mixtures import mixed_pixels, seeded, smooth_endmembers, surface_pixels, worst_angle
+from tests.factories.mixtures import mixed_pixels, seeded, smooth_endmembers, surface_pixels, worst_angle
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.metrics import spectral_angle
 from unmix_plugin.spectral.unmixing.pooled_search import pooled_search

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.testing import assert_close
 
-from tests.spectral.mixtures import mixed_pixels, seeded, smooth_endmembers, worst_angle
+from tests.factories.mixtures import mixed_pixels, seeded, smooth_endmembers, worst_angle
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.unmixing import simplex_corners
 from unmix_plugin.spectral.unmixing.simplex_corners import minimum_volume_simplex, nfindr, vca

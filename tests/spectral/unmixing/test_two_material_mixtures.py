@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from tests.spectral.mixtures import seeded, smooth_endmembers, surface_pixels, worst_angle
+from tests.factories.mixtures import seeded, smooth_endmembers, surface_pixels, worst_angle
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.unmixing.abundances import nnls
 from unmix_plugin.spectral.unmixing.two_material_mixtures import (

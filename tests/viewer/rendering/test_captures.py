@@ -12,7 +12,7 @@ import pytest
 import torch
 import tyro
 
-from tests.viewer.view_factory import make_frame, no_scene, some_pose
+from tests.factories.views import make_frame, no_scene, some_pose
 from unmix_plugin.engine.geometry.key_poses import KeyPoses
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.figures.paint import ColourScale

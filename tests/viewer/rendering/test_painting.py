@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.testing import assert_close
 
-from tests.method_factory import with_a_sky
-from tests.viewer.view_factory import make_aids, make_frame, make_source, paint_layer
+from tests.factories.models import with_a_sky
+from tests.factories.views import make_aids, make_frame, make_source, paint_layer
 from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.figures.look import BACKGROUNDS
 from unmix_plugin.figures.paint import ColourScale, colour_table

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.testing import assert_close
 
-from tests.viewer.view_factory import make_frame, make_source
+from tests.factories.views import make_frame, make_source
 from unmix_plugin.editing import Recipe
 from unmix_plugin.editing.recipe import Gloss, Remove
 from unmix_plugin.trained import gradual

@@ -4,7 +4,7 @@ import threading
 
 import pytest
 
-from tests.viewer.view_factory import make_source
+from tests.factories.views import make_source
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.trained.regions import Box
 from unmix_plugin.viewer.rendering.pictures import PictureMaker

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from tests.method_factory import make_model
-from tests.viewer import view_factory
-from tests.viewer.view_factory import LARGEST, Screen, finest, finish, make_loop, some_pose
+from tests.factories import views
+from tests.factories.models import make_model
+from tests.factories.views import LARGEST, Screen, finest, finish, make_loop, some_pose
 from unmix_plugin.editing import Light, Recipe, Remove, Scale
 from unmix_plugin.engine.training.training_control import TrainingControl
 from unmix_plugin.trained.gradual import FrameRender, numbers_per_pixel
@@ -241,8 +241,8 @@ def test_a_view_that_is_removed_in_mid_render_is_shown_nothing_more(loop, screen
 def training(tmp_path):
     """A model under training, and a loop that shows it in a thread of its own."""
     control, model, screen = TrainingControl(), make_model(), Screen()
-    source = view_factory.source_of_model(model, tmp_path, control)
-    with view_factory.running_loop(source) as loop:
+    source = views.source_of_model(model, tmp_path, control)
+    with views.running_loop(source) as loop:
         screen.view.largest_height = LARGEST
         loop.add(screen.view)
         yield control, model, source, loop, screen

@@ -10,8 +10,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.method_factory import make_model, make_scene, scene_of
-from tests.viewer.view_factory import ring
+from tests.factories.models import make_model, make_scene, scene_of
+from tests.factories.views import ring
 from unmix_plugin.editing import Gloss, Light, Recipe, Remove, Retint, Scale, Swap, sample_seen
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.scenes.demo.scene import make_demo_scene

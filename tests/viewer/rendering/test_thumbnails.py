@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.scenes.scene_factory import make_scene
+from tests.factories.scenes import make_scene
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.viewer.rendering import thumbnails

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
+import pytest
 import torch
 from torch import Tensor
 
-from tests.method_factory import make_model, scene_of
-from tests.scenes.scene_factory import look_at
-from tests.trained.camera_scenes import cameras_at
+from tests.factories.cameras import cameras_at
+from tests.factories.models import make_model, scene_of
+from tests.factories.scenes import look_at
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.field import CoefficientField
 from unmix_plugin.light.lamp import Lamp, MovingLamp
@@ -128,3 +131,12 @@ def seen_surface(
 
 ALL_ROUND = [(x, y, z) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.5, 1.5)]
 FROM_ABOVE = [(x, y, 1.5) for x in (-1.0, 1.0) for y in (-1.0, 1.0)]
+
+
+@contextmanager
+def few_rays(num_rays: int) -> Iterator[None]:
+    """Context in which a surface is looked at with so many rays, and pages have small pictures."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("unmix_plugin.trained.surface_mesh._NUM_RAYS", num_rays)
+        patch.setattr("unmix_plugin.products.page.page._PICTURE_PX", 48)
+        yield

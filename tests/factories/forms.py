@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from tests.captures.file_factory import AXES, header_text
-from tests.commands.running import done, refused
+from tests.factories.commands import done, refused
+from tests.factories.files import AXES, header_text
 from unmix_plugin.commands.process import process
 
 HEIGHT, WIDTH, VIEWS = 24, 36, 5

@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tests.method_factory import make_model, scene_of
-from tests.trained.camera_scenes import cameras_at
+from tests.factories.cameras import cameras_at
+from tests.factories.models import make_model, scene_of
 from unmix_plugin.editing import Recipe, edit_scene, recipe_from_yaml
 from unmix_plugin.field import UnmixField
 from unmix_plugin.spectral.materials import Coefficients

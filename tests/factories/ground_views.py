@@ -5,7 +5,7 @@ import torch
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from tests.scenes.scene_factory import cameras_of
+from tests.factories.scenes import cameras_of
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import KeyPoses
 

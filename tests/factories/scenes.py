@@ -1,4 +1,4 @@
-"""Tiny scene folders for tests: a matt ball at the origin, seen from a ring of cameras, written and then damaged."""
+"""Tiny scene folders: a matt ball at the origin, seen from a ring of cameras, by a rig, or by line cameras."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.settings import SceneOptions
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.sensor import read_sensor
 
 WIDTH, HEIGHT = 20, 16
 WAVELENGTHS = (450.0, 520.0, 600.0, 680.0)
@@ -180,3 +182,78 @@ def fault_of(folder: SceneFolder, **options: Any) -> str:
 
 def set_frame(index: int, **values: Any) -> Callable[[dict[str, Any]], None]:
     return lambda content: content["frames"][index].update(values)
+
+
+RESPONSES = "wavelength,red,blue\n480,0,1\n560,0.5,1\n640,1,0\n"
+"""Of a camera with two channels, the longer waves first."""
+
+
+def make_rig(root: Path) -> SceneFolder:
+    """Frames 0 to 2 have all four bands, 3 and 4 two bands at half the size, 5 the channels of `RESPONSES`."""
+    folder = make_scene(root)
+    for index in (3, 4):
+        halve(folder, index)
+        folder.edit_cube(index, lambda cube: cube[..., [2, 0]])
+        folder.edit(set_frame(index, bands=[2, 0], sensor="small"))
+    (root / "colours.csv").write_text(RESPONSES, encoding="utf-8")
+    channels = read_sensor(root / "colours.csv").seen_by(Bands.of(WAVELENGTHS)).matrix[:, ::-1]
+    folder.edit_cube(5, lambda cube: cube.astype(np.float32) @ channels.astype(np.float32))
+    return folder.edit(set_frame(5, responses_path="colours.csv"))
+
+
+def halve(folder: SceneFolder, index: int) -> None:
+    """Bring a frame's files and lens to half the size."""
+    folder.edit_cube(index, lambda cube: cube.astype(np.float32).reshape(8, 2, 10, 2, -1).mean(axis=(1, 3)))
+    for kind in ("images", "labels"):
+        path = folder.root / f"{kind}/view_{index}.png"
+        Image.fromarray(np.asarray(Image.open(path))[::2, ::2]).save(path)
+    path = folder.root / f"abundances/view_{index}.npy"
+    np.save(path, np.load(path)[::2, ::2])
+    folder.edit(set_frame(index, w=10, h=8, fl_x=14.0, fl_y=14.0, cx=5.0, cy=4.0))
+
+
+SWEEP = 1.0
+"""How far each camera moves along its y axis from the first row to the last, to either side of the middle."""
+
+
+def row_poses(pose: np.ndarray, num_rows: int = HEIGHT) -> list[np.ndarray]:
+    """A camera that moves evenly down its own y axis while it takes the rows."""
+    poses = []
+    for row in range(num_rows):
+        moved = pose.copy()
+        moved[:3, 3] += (1.0 - 2.0 * row / (num_rows - 1)) * SWEEP * pose[:3, 1]
+        poses.append(moved)
+    return poses
+
+
+def swept_alpha(pose: np.ndarray, radius: float) -> np.ndarray:
+    """Which pixels (H, W) of the sweep have the ball at their middle."""
+    x = (np.arange(WIDTH) + 0.5 - WIDTH / 2) / FOCAL
+    local = np.stack([x, np.zeros_like(x), -np.ones_like(x)], axis=-1)
+    cover = np.zeros((HEIGHT, WIDTH))
+    for row, own in enumerate(row_poses(pose)):
+        directions = local @ own[:3, :3].T
+        directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+        position = own[:3, 3]
+        along = -(directions @ position)
+        cover[row] = (position @ position - along**2 < radius**2) & (along > 0)
+    return cover
+
+
+def make_line_scene(root: Path, frames: int = 6, radius: float = 0.6) -> SceneFolder:
+    """The scene of `make_scene` taken by line cameras; even frames say a pose a row, odd ones key poses."""
+    scene, poses = make_scene(root, frames, radius=radius), ring_poses(frames)
+    entries: list[dict[str, Any]] = scene.content["frames"]
+    for index, (entry, pose) in enumerate(zip(entries, poses, strict=True)):
+        cover = swept_alpha(pose, radius)
+        np.save(root / entry["hyperspectral_file_path"], (cover[..., None] * SPECTRUM).astype(np.float16))
+        grey, alpha = (200 * cover).astype(np.uint8), np.round(255 * cover).astype(np.uint8)
+        Image.fromarray(np.stack([grey, grey, grey, alpha], axis=-1)).save(root / entry["file_path"])
+        del entry["transform_matrix"], entry["seg_file_path"], entry["abundance_file_path"]
+        matrices = [matrix.tolist() for matrix in row_poses(pose)]
+        if index % 2:
+            rows = (0, HEIGHT - 1)
+            entry["key_poses"] = [{"row": row, "transform_matrix": matrices[row]} for row in rows]
+        else:
+            entry["row_poses"] = matrices
+    return scene.edit(lambda content: content.update(frames=entries))

@@ -6,8 +6,8 @@ from contextlib import contextmanager
 import numpy as np
 from PIL import Image
 
-from tests.viewer.view_factory import no_scene
-from tests.viewer_page import Page
+from tests.factories.viewer_page import Page
+from tests.factories.views import no_scene
 from unmix_plugin.viewer.access import ViewerOptions
 from unmix_plugin.viewer.server import Viewer
 from unmix_plugin.viewer.session import Services

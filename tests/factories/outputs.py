@@ -1,4 +1,4 @@
-"""Videos, read with imageio."""
+"""Files that were written, read with other people's readers."""
 
 from __future__ import annotations
 
@@ -9,6 +9,12 @@ from typing import Any
 
 import imageio.v2 as imageio
 import numpy as np
+import trimesh
+
+
+def loaded_mesh(path: Path) -> Any:
+    """A file of any format as one mesh of trimesh, its vertices as they are in the file."""
+    return trimesh.load(path, process=False, force="mesh")
 
 
 def read_video(path: Path) -> tuple[np.ndarray, dict[str, Any]]:

@@ -1,7 +1,10 @@
-"""What is in a page, as a browser would read it."""
+"""What is on the pages of the documentation, and in a page of HTML as a browser would read it."""
+
+from __future__ import annotations
 
 import re
 from html.parser import HTMLParser
+from pathlib import Path
 
 VOID = {"meta", "img", "br", "line"}
 
@@ -57,3 +60,17 @@ def assert_self_contained(page: str) -> Outline:
     assert not re.search(r"url\(|@import|https?://", page)
     assert "default-src 'none'" in page
     return outline
+
+
+ROOT = Path(__file__).parents[2]
+
+
+def text_of(page: str) -> str:
+    """A page of the repository."""
+    return (ROOT / page).read_text(encoding="utf-8")
+
+
+def blocks_of(page: str, language: str) -> list[str]:
+    """The blocks of code of a page in a language ("" for none)."""
+    found = re.findall(r"^```(\w*)\n(.*?)^```$", text_of(page), flags=re.DOTALL | re.MULTILINE)
+    return [code for name, code in found if name == language]

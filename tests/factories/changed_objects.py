@@ -12,7 +12,7 @@ import numpy as np
 import torch
 import trimesh
 
-from tests.method_factory import make_scene
+from tests.factories.models import make_scene
 from unmix_plugin.comparing.captured import Capture, Observed, Surface
 from unmix_plugin.comparing.registration import Similarity
 from unmix_plugin.spectral.bands import Bands

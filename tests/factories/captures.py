@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from tests.captures.file_factory import AXES, header_text
+from tests.factories.files import AXES, header_text
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.process import process_capture
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.captures.file_factory import present, write_band_file
+from tests.factories.files import present, write_band_file
 from unmix_plugin.captures.poses.lens import Lens
 
 WIDTH, HEIGHT = 64, 48

@@ -11,7 +11,7 @@ import torch
 import trimesh
 from torch import Tensor
 
-from tests.viewer.view_factory import BOX, ring
+from tests.factories.views import BOX, ring
 from unmix_plugin.engine.runs.scene_record import SceneRecord
 from unmix_plugin.neumatex.fit.tone import tone_curve
 from unmix_plugin.neumatex.fit.trained_object import TrainedObject

@@ -11,7 +11,7 @@ import numpy as np
 import trimesh
 from PIL import Image
 
-from tests.commands.running import done, run_of
+from tests.factories.commands import done, run_of
 from unmix_plugin.commands.train import train
 from unmix_plugin.formats.exr import write_exr
 

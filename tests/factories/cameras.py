@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from tests.scenes.scene_factory import cameras_of, look_at, ring_poses
+from tests.factories.scenes import cameras_of, look_at, ring_poses
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.engine.runs.load_run import SceneRecord

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from tests.engine.rgb_nerf_plugin import rgb_nerf
+from tests.factories.rgb_nerf import rgb_nerf
 from unmix_plugin.engine import MethodSpecification
 from unmix_plugin.formats.files import write_file
 from unmix_plugin.products.product import Job, RunProduct

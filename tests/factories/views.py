@@ -10,9 +10,9 @@ from typing import Any
 
 from torch import Tensor
 
-from tests.method_factory import BOX, make_model
-from tests.scenes.scene_factory import ring_poses
-from tests.trained.camera_scenes import cameras_at
+from tests.factories.cameras import cameras_at
+from tests.factories.models import BOX, make_model
+from tests.factories.scenes import ring_poses
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.runs.load_run import SceneRecord
 from unmix_plugin.engine.runs.run_folder import RunFolder

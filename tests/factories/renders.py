@@ -10,9 +10,9 @@ import numpy as np
 import OpenEXR
 import spectral.io.envi as envi
 
-from tests.method_factory import make_scene
-from tests.scenes.scene_factory import ring_poses
-from tests.trained.camera_scenes import cameras_at
+from tests.factories.cameras import cameras_at
+from tests.factories.models import make_scene
+from tests.factories.scenes import ring_poses
 from unmix_plugin.products.render.cameras import RenderCameras
 from unmix_plugin.products.render.files import FormattedOutput, choose_formats
 from unmix_plugin.products.render.job import RenderJob, Survey, take_survey

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from tests.scenes.scene_factory import ball_alpha, cameras_of, ring_poses
+from tests.factories.scenes import ball_alpha, cameras_of, ring_poses
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.scenes.geometry.carving import carve_box

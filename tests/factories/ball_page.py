@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from tests.products.ball_model import ALL_ROUND, RADIUS, ball_scene, cameras_around
-from tests.products.few_rays import few_rays
-from tests.trained.camera_scenes import FRAME
+from tests.factories.ball_model import ALL_ROUND, RADIUS, ball_scene, cameras_around, few_rays
+from tests.factories.cameras import FRAME
 from unmix_plugin.engine.processes import ALONE
 from unmix_plugin.products.page import page
 from unmix_plugin.products.product import Job
