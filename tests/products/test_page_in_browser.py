@@ -328,3 +328,74 @@ def test_one_side_of_something_thin_is_seen(shape, away, browser, tmp_path):
         stroke(opened, EVERYTHING)
         (seen,) = probes(opened, "area")
     assert seen["area"] == pytest.approx(1 / FRAME.scale**2, rel=0.08)
+
+
+NOTE = "</script><script>document.title=1</script>\n<img src=x onerror='document.title=1'> {{ facts }} é"
+
+
+def saved_copy(opened, path):
+    opened.evaluate("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
+    with opened.expect_download() as saving:
+        opened.click("#copy")
+    saving.value.save_as(path)
+    return path
+
+
+def test_notes_at_places_travel_in_copies_of_the_page(exported, browser, tmp_path):
+    Image.new("RGBA", (3000, 500), (255, 0, 0, 255)).save(tmp_path / "picture.png")
+    (tmp_path / "none.png").write_text("no picture")
+    stored = "unmixPage.notes.map(({ text, place, from, picture }) => [text, place.toArray(), from.toArray(), picture])"
+    with looking(browser, exported[2]) as opened:
+        opened.evaluate("(unmixPage.wholeObject(), unmixPage.draw())")
+        opened.keyboard.press("n")
+        opened.mouse.click(285, 300)
+        opened.keyboard.type(NOTE)
+        place = opened.evaluate("unmixPage.pick(285, 300).place.toArray()")
+        opened.locator("#notes input[type=file]").set_input_files(tmp_path / "none.png")
+        opened.wait_for_function(
+            "document.querySelector('#noted').textContent.startsWith('none.png is no picture')"
+        )
+        opened.locator("#notes input[type=file]").set_input_files(tmp_path / "picture.png")
+        opened.wait_for_selector("#notes img")
+        before = opened.evaluate(stored)
+        assert "Not saved yet" in opened.inner_text("#noted")
+        copy = saved_copy(opened, tmp_path / "copy.html")
+        assert not opened.inner_text("#noted")
+        assert not opened.evaluate("unmixPage.probes.length > 2")  # the click was for the note
+    with looking(browser, copy) as opened:
+        ((text, at, _, picture),) = after = opened.evaluate(stored)
+        assert (text, opened.title()) == (NOTE, TITLE)
+        np.testing.assert_allclose(at, place, atol=1e-6 * WORLD_RADIUS)
+        for one, other in zip(before[0][1:3], after[0][1:3], strict=True):
+            np.testing.assert_allclose(one, other, atol=1e-9)
+        shown = Image.open(io.BytesIO(base64.b64decode(picture.split(",")[1])))
+        assert (shown.size, before[0][3]) == ((1024, 171), picture)
+        opened.evaluate("unmixPage.draw()")
+        assert "1 </script>" in opened.inner_text("#labels")
+        assert opened.locator("#notes textarea").input_value() == NOTE
+        assert saved_copy(opened, tmp_path / "again.html").read_bytes() == copy.read_bytes()
+
+
+def test_notes_that_a_file_makes_up_are_left_out_and_said(exported, browser, tmp_path):
+    notes = (
+        '[{"text": 1}, null, {"text": "a", "place": [0, 0, 1e999], "from": [0, 0, 0], "picture": null}, '
+        '{"text": "a", "place": [0, 0, 0], "from": [1, 1, 1], "picture": "https://example.org/x.png"}]'
+    )
+    path, page_of = tmp_path / "page.html", exported[2].read_text()
+    for content, count in ((notes, 4), ("{", 1)):
+        path.write_text(page_of.replace('id="data-notes">[]', f'id="data-notes">{content}'))
+        with looking(browser, path) as opened:
+            assert opened.evaluate("unmixPage.notes.length") == 0
+            assert opened.inner_text("#noted").startswith(f"{count} of the notes in this file can't be read")
+
+
+def test_labels_do_not_overlap(opened):
+    opened.evaluate("(unmixPage.wholeObject(), unmixPage.draw())")
+    for row in range(6):
+        opened.mouse.click(285, 300 + row)
+    opened.evaluate("unmixPage.draw()")
+    boxes = [one.bounding_box() for one in opened.locator("#labels .placed").all()]
+    assert len(boxes) == 8
+    for one, other in itertools.combinations(boxes, 2):
+        beside = abs(one["x"] - other["x"]) >= min(one["width"], other["width"])
+        assert beside or abs(one["y"] - other["y"]) >= one["height"]

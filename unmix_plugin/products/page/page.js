@@ -25,7 +25,10 @@
   }
 
   // ---- data ---------------------------------------------------------------------------------------------------------
-  const letters = atob($("data-arrays").textContent);
+  const packed = $("data-arrays").textContent;
+  $("data-arrays").textContent = ""; // kept once
+  const untouched = document.documentElement.cloneNode(true); // the page as it came, for copies of it
+  const letters = atob(packed);
   const bytes = new Uint8Array(letters.length);
   for (let i = 0; i < letters.length; i++) bytes[i] = letters.charCodeAt(i);
   $("data-arrays").remove();
@@ -568,20 +571,28 @@
     });
     markOf.needsUpdate = true;
   };
-  // Names beside the points and regions that are seen from here.
+  // Names beside the points, regions and notes that are seen from here, each in the nearest row that is free.
   const placeLabels = () => {
     const labels = $("labels");
-    const shown = probes.filter((probe) => probe.isShown);
+    const noted = notes.map((note) => ({ name: nameOf(note), colour: NOTE, place: note.place }));
+    const shown = [...probes.filter((probe) => probe.isShown), ...noted];
+    const taken = [];
     while (labels.children.length < shown.length) labels.append(make("span"));
     [...labels.children].forEach((label, i) => {
       const { name, colour, place, anchors = [shown[i]] } = shown[i] ?? { anchors: [] };
       const anchor = anchors.find((one) => pixelOf(one.place) && isSeen(one));
       label.hidden = !anchor;
+      label.className = "";
       if (!anchor) return;
-      const [x, y] = pixelOf(anchor.place);
-      Object.assign(label.style, { left: `${x}px`, top: `${y}px`, borderColor: colour });
-      label.className = place ? "above" : "";
       label.textContent = name;
+      const [x, y] = pixelOf(anchor.place);
+      const [width, height] = [label.offsetWidth + 2, label.offsetHeight + 2];
+      const rows = [...(place ? [] : [0]), ...Array.from({ length: 16 }, (_, step) => (step % 2 ? 1 : -1) * (1 + (step >> 1)))];
+      const isFree = (row) => taken.every((one) => 2 * Math.abs(one.x - x) >= one.width + width || Math.abs(one.y - y - row * height) >= height);
+      const row = rows.find(isFree) ?? rows[0];
+      taken.push({ x, y: y + row * height, width });
+      Object.assign(label.style, { left: `${x}px`, top: `${y + row * height}px`, borderColor: colour });
+      label.className = "placed";
     });
   };
 
@@ -615,6 +626,7 @@
   const showMarks = () => {
     marks.clear();
     probes.filter((probe) => probe.isShown && probe.place).forEach((probe) => marks.add(markAt(probe.place, probe.colour)));
+    notes.forEach((note) => marks.add(markAt(note.place, NOTE)));
     rulerEnds.forEach((place) => marks.add(markAt(place, "#ffb000")));
     if (rulerEnds.length === 2)
       marks.add(new Kit.Line(new Kit.BufferGeometry().setFromPoints(rulerEnds), new Kit.LineBasicMaterial({ color: "#ffb000", depthTest: false })));
@@ -802,6 +814,90 @@
   $("curve").onchange = () => { $("window").hidden = !isRemoved(); listProbes(); };
   $("low").onchange = $("high").onchange = () => listProbes();
 
+  // ---- notes: what readers write at places, kept in the copies that they save ----------------------------------------
+  const notes = []; // { text, place, from, picture }: `from` is where the eye was, `picture` a URL that holds it, or null
+  const NOTE = "#0b5cad";
+  const MOST_PX = 1024; // sides of a picture
+  let isUnsaved = false;
+  const nameOf = (note) => `${notes.indexOf(note) + 1} ${note.text.trim().split("\n")[0]}`;
+  const noteToStore = ({ text, place, from, picture }) => ({ text, place: world(place), from: world(from), picture });
+  // What a file says is a note, or nothing: it may have been written by hand.
+  const noteFrom = ({ text, place, from, picture } = {}) => {
+    const isPlace = (values) => Array.isArray(values) && values.length === 3 && values.every(Number.isFinite);
+    const isPicture = picture === null || /^data:image\/jpeg;base64,[A-Za-z0-9+/]+=*$/.test(picture);
+    if (typeof text !== "string" || !isPlace(place) || !isPlace(from) || !isPicture) return null;
+    const [at, eye] = [place, from].map((values) => new Kit.Vector3(...values.map((value, axis) => value - offset[axis])));
+    return { text, place: at, from: eye, picture };
+  };
+  const openNotes = () => {
+    let stored = null;
+    try { stored = JSON.parse($("data-notes").textContent); } catch { /* said below */ }
+    const found = (Array.isArray(stored) ? stored : [null]).map((one) => noteFrom(one ?? {}));
+    notes.push(...found.filter(Boolean));
+    const damaged = found.length - notes.length;
+    if (damaged) $("noted").textContent = `${damaged} of the notes in this file can't be read; a copy will lack ${damaged === 1 ? "it" : "them"}.`;
+    if (found.length) $("notes").closest("details").open = true;
+    listNotes();
+  };
+  const changeNotes = () => { isUnsaved = true; $("noted").textContent = "Not saved yet: save a copy of the page."; redraw(); };
+  const addNote = (place) => {
+    notes.push({ text: "", place, from: camera.position.clone(), picture: null });
+    setMode(null);
+    changeNotes();
+    listNotes();
+    if ($("panel").classList.contains("folded")) fold();
+    $("notes").closest("details").open = true;
+    $("notes").lastElementChild.querySelector("textarea").focus();
+  };
+  // A picture of any size as JPEG, on white, without what cameras write beside it.
+  const readPicture = async (file) => {
+    const image = await createImageBitmap(file);
+    const smaller = Math.min(1, MOST_PX / Math.max(image.width, image.height));
+    const [width, height] = [image.width, image.height].map((side) => Math.max(1, Math.round(smaller * side)));
+    const drawn = make("canvas", { width, height });
+    const brush = drawn.getContext("2d");
+    brush.fillStyle = "#fff";
+    brush.fillRect(0, 0, width, height);
+    brush.drawImage(image, 0, 0, width, height);
+    return drawn.toDataURL("image/jpeg", 0.85);
+  };
+  const noteRow = (note, i) => {
+    const look = make("button", { textContent: i + 1, title: "look at the place", onclick: () => lookFrom(note.from, note.place) });
+    const file = make("input", { type: "file", accept: "image/*", hidden: true });
+    file.onchange = async () => {
+      try {
+        note.picture = await readPicture(file.files[0]);
+      } catch {
+        $("noted").textContent = `${file.files[0].name} is no picture that this browser reads: choose a JPEG or PNG.`;
+        return;
+      }
+      changeNotes();
+      listNotes();
+    };
+    const picture = note.picture
+      ? make("button", { textContent: "Remove picture", onclick: () => { note.picture = null; changeNotes(); listNotes(); } })
+      : make("button", { textContent: "Picture", title: "add a picture", onclick: () => file.click() });
+    const remove = make("button", { textContent: "×", title: "remove the note", onclick: () => { notes.splice(notes.indexOf(note), 1); changeNotes(); listNotes(); } });
+    const text = make("textarea", { value: note.text, maxLength: 4000 });
+    text.setAttribute("aria-label", `note ${i + 1}`);
+    text.oninput = () => { note.text = text.value; changeNotes(); };
+    const shown = note.picture ? [make("img", { src: note.picture, alt: `picture of note ${i + 1}` })] : [];
+    return make("div", { className: "probe" }, look, picture, file, make("span"), remove, text, ...shown);
+  };
+  const listNotes = () => { $("notes").replaceChildren(...notes.map(noteRow)); showMarks(); };
+  const copyOfPage = () => {
+    const inScript = (value) => JSON.stringify(value).replaceAll("<", "\\u003c"); // no text ends its element
+    untouched.querySelector("#data-notes").textContent = inScript(notes.map(noteToStore));
+    untouched.querySelector("#data-arrays").textContent = packed;
+    return `<!DOCTYPE html>\n${untouched.outerHTML}`;
+  };
+  $("copy").onclick = () => {
+    save("page-with-notes.html", new Blob([copyOfPage()], { type: "text/html" }));
+    isUnsaved = false;
+    $("noted").textContent = "";
+  };
+  addEventListener("beforeunload", (event) => { if (isUnsaved) event.preventDefault(); });
+
   // ---- lengths ------------------------------------------------------------------------------------------------------
   const lengthText = (length) => {
     if (metresPerUnit === null) return `${shownNumber(length)} world ${length === 1 ? "unit" : "units"}`;
@@ -821,18 +917,18 @@
   };
   // What a click or a stroke is for: a spectrum (no mode), the ruler, or a region.
   let mode = null;
-  const HINTS = { ruler: "Click two points of the object.", region: "Draw around a part of the object." };
+  const HINTS = { ruler: "Click two points of the object.", region: "Draw around a part of the object.", note: "Click the place that the note is about." };
   const setMode = (name) => {
     mode = name;
     $("hint").textContent = HINTS[mode] ?? "";
-    ["ruler", "region"].forEach((one) => $(one).setAttribute("aria-pressed", mode === one));
+    Object.keys(HINTS).forEach((one) => $(one).setAttribute("aria-pressed", mode === one));
     controls.enabled = mode !== "region";
     if (mode === "ruler") rulerEnds.length = 0;
     if (mode && innerWidth <= 700 && !$("panel").classList.contains("folded")) fold();
     showLength();
     showMarks();
   };
-  ["ruler", "region"].forEach((name) => { $(name).onclick = () => setMode(mode === name ? null : name); });
+  Object.keys(HINTS).forEach((name) => { $(name).onclick = () => setMode(mode === name ? null : name); });
   $("true-length").onchange = () => {
     const metres = Number($("true-length").value);
     const length = rulerEnds.length === 2 ? rulerEnds[0].distanceTo(rulerEnds[1]) : 0;
@@ -886,6 +982,8 @@
       rulerEnds.push(found.place);
       showLength();
       showMarks();
+    } else if (mode === "note") {
+      addNote(found.place);
     } else {
       addProbe("point", found);
       showProbes();
@@ -919,13 +1017,13 @@
   $("fold").onclick = fold;
   const step = (by) => { if (state.layer === "band") { state.band = Math.min(Math.max(state.band + by, 0), B - 1); showArguments(); paint(); } };
   const keys = {
-    0: wholeObject, t: theme, p: fold, r: () => $("ruler").click(), d: () => $("region").click(), "[": () => step(-1), "]": () => step(1),
+    0: wholeObject, t: theme, p: fold, r: () => $("ruler").click(), d: () => $("region").click(), n: () => $("note").click(), "[": () => step(-1), "]": () => step(1),
     Escape: () => (mode ? setMode(null) : $("clear").click()),
   };
   layers.forEach(([layer], index) => (keys[index + 1] = () => choose(layer)));
   addEventListener("keydown", (event) => {
     const isAlt = (event.ctrlKey || event.metaKey || event.altKey) && !event.getModifierState("AltGraph");
-    if (isAlt || event.target.matches("select, input[type='text'], input[type='number']")) return;
+    if (isAlt || event.target.matches("select, textarea, input[type='text'], input[type='number']")) return;
     keys[event.key.length === 1 ? event.key.toLowerCase() : event.key]?.();
   });
 
@@ -943,7 +1041,7 @@
       `${B} bands, ${facts.wavelengths_nm[0]} to ${facts.wavelengths_nm[B - 1]} nm`,
       facts.is_light_known ? "spectra of points are reflectance" : "the light is unknown: spectra are radiance, 1 = full scale",
     ] : []),
-    ...(facts.scale ? [`scale: ${facts.scale}`] : []), ...facts.notes, facts.made, "Keys: 1 to 7 layers, [ and ] bands, 0 whole object, D draw a region, R ruler, T light or dark, P panel, Esc clears; arrows move, with shift they turn.",
+    ...(facts.scale ? [`scale: ${facts.scale}`] : []), ...facts.notes, facts.made, "Keys: 1 to 7 layers, [ and ] bands, 0 whole object, D draw a region, R ruler, N note, T light or dark, P panel, Esc clears; arrows move, with shift they turn.",
   ];
   $("facts").replaceChildren(...about.map((text) => make("p", { className: "note", textContent: text })));
   document.querySelector("#head h1").textContent = facts.title;
@@ -959,9 +1057,10 @@
     const found = measureRegion(keptShares.subarray(r * V, (r + 1) * V));
     if (found) addProbe("region", found, { name, isKept: true, isShown: r < COLOURS.length });
   });
+  openNotes();
   choose("colour");
   showProbes();
   wholeObject();
   frame();
-  window.unmixPage = { state, choose, lookThrough, wholeObject, pick, fold, csvText, facts, draw, probes, materialAreas: [...materialAreas] };
+  window.unmixPage = { state, choose, lookThrough, wholeObject, pick, fold, csvText, facts, draw, probes, notes, materialAreas: [...materialAreas] };
 })();
