@@ -29,7 +29,7 @@ from unmix_plugin.formats.files import RowSink, raw_rows
 from unmix_plugin.limits import MOST_BANDS, MOST_ITEMS, MOST_TEXT_BYTES, read_bounded
 from unmix_plugin.spectral.bands import Bands
 
-HeaderValue: TypeAlias = str | int | Sequence[str] | Sequence[float] | np.ndarray
+HeaderValue: TypeAlias = str | int | Sequence[str | int | float] | np.ndarray
 
 _TYPES = {1: "u1", 2: "i2", 3: "i4", 4: "f4", 5: "f8", 12: "u2", 13: "u4", 14: "i8", 15: "u8"}
 _FLOAT32, UINT16 = 4, 12
@@ -436,8 +436,10 @@ def header_bytes(values: Mapping[str, HeaderValue]) -> bytes:
     def plain(text: str) -> str:
         return re.sub(r"\s+", " ", text.replace("{", "(").replace("}", ")")).strip()
 
-    def element(value: str | float) -> str:
-        return plain(value).replace(",", "-") if isinstance(value, str) else repr(float(value))
+    def element(value: str | int | float) -> str:
+        if isinstance(value, str):
+            return plain(value).replace(",", "-")
+        return str(value) if isinstance(value, int) else repr(float(value))  # a zone is a whole number
 
     lines = ["ENVI"]
     for key, value in values.items():

@@ -28,9 +28,11 @@ SCENE = replace(ball_scene(), frame=Normalisation(TURN, np.zeros(3), 0.25, PLACE
 SCALE = Scale(1.0, "test")
 
 
-def rendered(folder, names, formats, pixel_size, cameras="map", scene=SCENE, scale: Scale | None = SCALE):
+def rendered(
+    folder, names, formats, pixel_size, cameras="map", scene=SCENE, scale: Scale | None = SCALE, epsg=None
+):
     """The camera of a map that is rendered into a folder, and its survey."""
-    chosen = choose_cameras(scene, RenderOptions(cameras=cameras, pixel_size=pixel_size), scale)
+    chosen = choose_cameras(scene, RenderOptions(cameras=cameras, pixel_size=pixel_size, epsg=epsg), scale)
     outputs = files.with_units(choose_formats(names, formats, scene, False), chosen.map_info)
     survey = take_survey(scene, chosen.views, [one.output for one in outputs], chosen.map_info)
     job = RenderJob(scene, chosen, outputs, survey, folder)
@@ -229,16 +231,24 @@ def test_names_of_bands_are_text_and_no_markup():
     assert names == ['a<b>&"c"', "ß"]
 
 
-def test_gdal_itself_shows_names_and_wavelengths_of_bands(tmp_path):
+@pytest.mark.parametrize("form", ["tif", "envi"])
+def test_gdal_itself_shows_where_a_map_lies_and_names_and_wavelengths_of_bands(tmp_path, form):
     rasterio = pytest.importorskip("rasterio")
-    rendered(tmp_path, ["spectral", "abundances", "false-colour:650,550,450"], ["tif"], 0.5)
-    with rasterio.open(tmp_path / "spectral" / "map_top.tif") as file:
-        assert file.descriptions == tuple(f"{nm:g} nm" for nm in SCENE.bands.centers_nm)
+    suffix = {"tif": "tif", "envi": "img"}[form]
+    rendered(tmp_path, ["spectral", "abundances", "false-colour:650,550,450"], [form], 0.5, epsg=32632)
+    with rasterio.open(tmp_path / "spectral" / f"map_top.{suffix}") as file:
+        assert (file.crs.to_epsg(), file.res) == (32632, (0.5, 0.5))
+        assert file.bounds.left < PLACE[0] < file.bounds.right
+        assert file.bounds.bottom < PLACE[1] < file.bounds.top
         for band, nm in zip(file.indexes, SCENE.bands.centers_nm, strict=True):
-            assert file.tags(band) == {"wavelength": f"{nm:g}", "wavelength_units": "Nanometers"}
-            shown_um = file.tags(band, ns="IMAGERY")["CENTRAL_WAVELENGTH_UM"]
-            assert float(shown_um) == pytest.approx(nm / 1000)
-    with rasterio.open(tmp_path / "abundances" / "map_top.tif") as file:
+            tags = file.tags(band)
+            assert (float(tags["wavelength"]), tags["wavelength_units"]) == (nm, "Nanometers")
+            if form == "tif":
+                assert file.descriptions[band - 1] == f"{nm:g} nm"
+                shown_um = file.tags(band, ns="IMAGERY")["CENTRAL_WAVELENGTH_UM"]
+                assert float(shown_um) == pytest.approx(nm / 1000)
+    with rasterio.open(tmp_path / "abundances" / f"map_top.{suffix}") as file:
         assert file.descriptions == SCENE.materials.names
-    with rasterio.open(tmp_path / "false-colour-650-550-450" / "map_top.tif") as file:
-        assert [one.name for one in file.colorinterp] == ["red", "green", "blue"]
+    if form == "tif":
+        with rasterio.open(tmp_path / "false-colour-650-550-450" / "map_top.tif") as file:
+            assert [one.name for one in file.colorinterp] == ["red", "green", "blue"]

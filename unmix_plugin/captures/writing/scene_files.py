@@ -466,5 +466,5 @@ def _draw_spectra(axes: Any, views: Sequence[SeenView], sensors: Mapping[str, Se
     axes.set_title("mean spectra of the foreground", fontsize=9)
     axes.set_xlabel("wavelength in nm", fontsize=8)
     axes.tick_params(labelsize=7)
-    axes.legend(fontsize=7, frameon=False)
+    axes.legend(fontsize=7, frameon=False, loc="lower right")  # "best" takes seconds where views are many
     plain_axes(axes)
