@@ -5,13 +5,14 @@ import json
 import re
 import sys
 import types
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
 import pytest
 
 import unmix_plugin.engine
-from tests.factories.commands import done, run
+from tests.factories.commands import done, refused, run
 from unmix_plugin.commands.eval import evaluate
 from unmix_plugin.commands.render import render
 from unmix_plugin.commands.train import train
@@ -37,12 +38,13 @@ def test_the_public_names_are_those_that_the_page_lists():
 def test_the_example_of_the_page_imports_public_names_only_trains_and_is_evaluated(tmp_path, monkeypatch):
     (code,) = re.findall(r"^`spectral_grid.py`\n\n```python\n(.*?)^```", PAGE, flags=re.DOTALL | re.MULTILINE)
     ours = set(re.findall(r"from (unmix_plugin\S*) import", code))
-    assert ours == {"unmix_plugin.datamanager", "unmix_plugin.engine"}
+    assert ours == {"unmix_plugin.datamanager", "unmix_plugin.engine", "unmix_plugin.spectral.metrics"}
     module = types.ModuleType("spectral_grid")
     monkeypatch.setitem(sys.modules, "spectral_grid", module)
     exec(compile(code, "spectral_grid.py", "exec"), module.__dict__)
     entry = importlib.metadata.EntryPoint("spectral-grid", "spectral_grid:method", registry.METHOD_GROUP)
-    monkeypatch.setattr(registry, "entry_points", lambda group: [entry])  # noqa: ARG005
+    known = [*registry.entry_points(group=registry.METHOD_GROUP), entry]
+    monkeypatch.setattr(registry, "entry_points", lambda group: known)  # noqa: ARG005
     make_demo_scene(tmp_path / "scene", 16, 4, 8)
     argv = ["--data", tmp_path / "scene", "--output-dir", tmp_path / "out", "--pipeline.model.resolution", 8]
     ended = done(train, "spectral-grid", *argv, "--max-num-iterations", 3, "--device", "cpu")
@@ -51,13 +53,36 @@ def test_the_example_of_the_page_imports_public_names_only_trains_and_is_evaluat
     view = loaded.model.get_outputs_for_camera(loaded.scene.eval_cameras[0])
     assert view["spectral"].shape == (16, 16, 4)
 
+    argv = ["--data", tmp_path / "scene", "--output-dir", tmp_path / "out", "--endmembers", 4]
+    ended = done(train, "unmix-nerf", *argv, "--max-num-iterations", 3, "--device", "cpu")
+    ours_path = Path(ended.last_line.removeprefix("run: "))
+    done(evaluate, path, ours_path, "--device", "cpu")
+    metrics = json.loads((path / "eval" / "metrics.json").read_text())
+    assert [image["name"] for image in metrics["per_view"]] == ["eval_002", "eval_006"]
+    for own, figure in (("image_psnr", "psnr"), ("image_sam", "sam")):
+        views = zip(metrics["own_per_image"], metrics["per_view"], strict=True)
+        assert figure == "sam" or all(
+            one[own] == pytest.approx(other[figure], abs=1e-4) for one, other in views
+        )
+    table = (path / "exports" / "comparison" / "figures.csv").read_text().splitlines()
+    rows = {row.split(",")[0]: row.split(",")[1:3] for row in table}
+    assert {"psnr", "ssim", "sam"} <= {name for name, values in rows.items() if all(values)}
+    assert rows["miou"][0] == "" != rows["miou"][1]
+
+    spectral, *_ = module.SpectralGrid.outputs
+    monkeypatch.setattr(module.SpectralGrid, "outputs", (replace(spectral, centers_nm=(1.0, 2.0, 3.0, 4.0)),))
+    assert "spectra are measured on the scene's own bands" in refused(
+        evaluate, "--run", path, "--device", "cpu"
+    )
     for named in ((), (Output("spectral", "channels", "spectra", "radiance on black"),)):
-        monkeypatch.setattr(module.SpectralGrid, "outputs", named, raising=False)
+        monkeypatch.setattr(module.SpectralGrid, "outputs", named)
         done(evaluate, "--run", path, "--device", "cpu")
         metrics = json.loads((path / "eval" / "metrics.json").read_text())
-        assert metrics["psnr"] > 3
+        assert metrics["image_psnr"] > 3
         assert metrics["views"] == 2
         assert [image["name"] for image in metrics["per_image"]] == ["eval_002", "eval_006"]
+        said = refused(evaluate, path, ours_path, "--device", "cpu")
+        assert "an Output of kind channels with a quantity" in said
     ended = run(evaluate, "--run", path, "--illuminant", "A", "--device", "cpu")
     assert "the method spectral-grid makes no scene of mixed materials" in " ".join(ended.err.split())
     done(render, "--run", path, "--output", tmp_path / "views", "--device", "cpu")

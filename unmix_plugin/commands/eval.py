@@ -14,7 +14,10 @@ from unmix_plugin.errors import ConfigError, counted
 from unmix_plugin.products.product import RunOptions, SharedViews
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from rich.console import Console
+    from rich.table import Table
 
     from unmix_plugin.engine.processes import Processes
     from unmix_plugin.engine.runs.load_run import LoadedPipeline
@@ -114,7 +117,7 @@ def _evaluate_run(
     from unmix_plugin.engine.runs.load_run import load_pipeline
     from unmix_plugin.formats.files import safe_name
     from unmix_plugin.products.comparison import ComparedRun
-    from unmix_plugin.products.evaluation import evaluate_images, evaluate_scene
+    from unmix_plugin.products.evaluation import evaluate_images, evaluate_scene, evaluate_spectra
 
     with processes.together():
         recipe = requested_recipe(options.edits, options.illuminant)
@@ -132,14 +135,17 @@ def _evaluate_run(
     shown = partial(follow, console)
     if scene is not None and measured is not None:
         found = evaluate_scene(scene, measured, factors, folder, shown, processes)
+    elif not processes.is_first:
+        found = None
     else:
-        found = evaluate_images(loaded.pipeline, folder, shown) if processes.is_first else None
+        found = None if measured is None else evaluate_spectra(loaded.pipeline, measured, folder, shown)
+        found = found or evaluate_images(loaded.pipeline, folder, shown)
     if found is None:
         return None
     if recipe is not None:
         found.more["edits"] = recipe_to_yaml(recipe)
     times = {"train_seconds": loaded.training.train_seconds}
-    if found.has_materials:
+    if found.bands:
         times["train_rays_per_second"] = loaded.training.train_rays_per_second
     figures = found.write(folder / "metrics.json", times)
     config = replace(loaded.config, data=None, output_dir=Path(), load_run=None)
@@ -152,17 +158,22 @@ def _evaluate_run(
         loaded.scene.eval_cameras.camera_to_world.numpy(),
         folder,
         flattened(config_to_json(config)),
+        tuple(found.more.get("aligned", ())),
     )
     if show:
-        _report(console, compared, found, recipe is not None, factors is not None)
+        _report(console, compared, found, scene is not None, recipe is not None, factors is not None)
     return compared
 
 
-def _report(console: Console, run: ComparedRun, found: Evaluated, is_edited: bool, is_relit: bool) -> None:
-    """Figures as a table, with what they are beside those that are everybody's; and where everything is."""
-    from rich.table import Table
-
-    from unmix_plugin.trained.evaluation import DEFINITIONS
+def _report(
+    console: Console,
+    run: ComparedRun,
+    found: Evaluated,
+    has_materials: bool,
+    is_edited: bool,
+    is_relit: bool,
+) -> None:
+    """Figures as a table, what is to be known beside them, and where everything is."""
     from unmix_plugin.trained.unexplained import describe_unexplained
     from unmix_plugin.trained.view_fit import describe_misfits, read_misfits
 
@@ -174,16 +185,7 @@ def _report(console: Console, run: ComparedRun, found: Evaluated, is_edited: boo
         title += f", {counted(figures['bands'], 'band')}"
         title += ", edited, against the scene as measured" if is_edited else ""
         title += " (in the same light)" if is_relit else ""
-    table = Table(title=title, title_justify="left")
-    table.add_column("figure", no_wrap=True)
-    table.add_column("value", justify="right", no_wrap=True)
-    table.add_column("what it is")
-    for name, value in figures.items():
-        is_common = "bands" in figures or name in ("views", "train_seconds")
-        unit = next((unit for word, unit in _UNITS.items() if word in name.split("_")), "")
-        if value is not None:
-            table.add_row(name, f"{value:.4g}{unit}", DEFINITIONS.get(name, "") if is_common else "")
-    console.print(table)
+    console.print(_figures_table(found, figures, title))
     unknown = [name for name, value in figures.items() if value is None]
     if unknown:
         tell(f"not measured, since the scene does not have the truth for it: {', '.join(unknown)}")
@@ -193,7 +195,27 @@ def _report(console: Console, run: ComparedRun, found: Evaluated, is_edited: boo
     if found.num_pictures:
         kinds = ": rgb/, segmentation/ and abundances/, truth, where there is one, beside prediction"
         drawn = counted(found.num_pictures, "picture")
-        tell(f"{run.pictures}  {drawn}{kinds if found.has_materials else ''}")
+        tell(f"{run.pictures}  {drawn}{kinds if has_materials else ''}")
+
+
+def _figures_table(found: Evaluated, figures: Mapping[str, float | None], title: str) -> Table:
+    """The figures that are known, with what they are beside those that are everybody's."""
+    from rich.table import Table
+
+    from unmix_plugin.trained.evaluation import DEFINITIONS
+
+    table = Table(title=title, title_justify="left")
+    table.add_column("figure", no_wrap=True)
+    table.add_column("value", justify="right", no_wrap=True)
+    table.add_column("what it is")
+    meanings = DEFINITIONS if "bands" in figures else {n: DEFINITIONS[n] for n in ("views", "train_seconds")}
+    rows = [(name, value, meanings.get(name, "")) for name, value in figures.items()]
+    rows += [(name, value, "as the method itself measures it") for name, value in found.own.items()]
+    for name, value, what in rows:
+        if value is not None:
+            unit = next((unit for word, unit in _UNITS.items() if word in name.split("_")), "")
+            table.add_row(name, f"{value:.4g}{unit}", what)
+    return table
 
 
 _ALIGNED = {

@@ -41,13 +41,15 @@ class ComparedRun:
     views: dict[str, dict[str, Any]]
     """Figures of each view, by its name."""
     bands: dict[str, BandErrors]
-    """Of each view; empty of methods that measure their images themselves."""
+    """Of each view; empty where the model measured its images itself."""
     cameras: Float[np.ndarray, "V 3 4"]
     """Camera to model space, of the evaluation views."""
     pictures: Path
     """Holds KIND/NAME.png."""
     settings: dict[str, Any]
     """By dotted name."""
+    aligned: tuple[str, ...] = ()
+    """What of each view was fitted to the measured one first: `gain`, `pose`."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,14 @@ def compare_runs(runs: Sequence[ComparedRun], folder: Path) -> Comparison:
         remarks.append(f"left out: {counted(len(blank), 'view')} without a valid pixel")
         runs = [_without_blank(run) for run in runs]
     first, names = runs[0], _shared_views(runs, remarks)
+    if len({run.aligned for run in runs}) > 1:
+        fitted = [
+            f"{label}: {' and '.join(run.aligned) or 'nothing'}"
+            for label, run in zip(labels, runs, strict=True)
+        ]
+        remarks.append(
+            f"not measured alike: fitted to each evaluation view first were, of {'; '.join(fitted)}"
+        )
     bands = {name: _shared_bands([run.bands[name] for run in runs]) for name in names if first.bands}
     squared = {
         name: np.stack([run.bands[name].mse[rows] for run, rows in zip(runs, at, strict=True)], axis=1)
@@ -182,7 +192,8 @@ def _shared_views(runs: Sequence[ComparedRun], remarks: list[str]) -> list[str]:
         if bool(other.bands) != bool(first.bands):
             raise ConfigError(
                 f"{first.path} is of {first.method}, {other.path} of {other.method}: these measure views differently; "
-                "compare runs of methods that measure alike"
+                "compare runs of methods that measure alike. The spectra of any method are measured as those of "
+                "unmix-nerf where its model names them: an Output of kind channels with a quantity"
             )
     names = [name for name in first.views if all(name in run.views for run in runs)]
     others = len({name for run in runs for name in run.views}) - len(names)

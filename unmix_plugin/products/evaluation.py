@@ -1,7 +1,8 @@
 """The evaluation of a run: figures of merit of every view, and prediction beside truth as pictures.
 
-A scene of mixed materials is measured against all that is known of its spectral scene. Models of other methods measure
-their images themselves. Both write metrics.json and a folder for each kind of picture.
+A scene of mixed materials is measured against all that is known of its spectral scene, and so are the spectra that a
+model of another method names. Others measure their images themselves. All write metrics.json and a folder for each kind
+of picture.
 
 True materials keep their colours in all pictures; a predicted endmember has the colour of the material that it is
 matched to, and one of its own where it is matched to none.
@@ -12,8 +13,9 @@ Notation: `H x W` pixels, `B` bands, `K` true materials, `P` predicted endmember
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +25,9 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from unmix_plugin.engine.outputs import Output
-from unmix_plugin.engine.pipeline import Pipeline, average_metrics
+from unmix_plugin.engine.pipeline import Pipeline, average_metrics, evaluating
 from unmix_plugin.engine.processes import Processes
+from unmix_plugin.errors import ConfigError, counted
 from unmix_plugin.figures.look import NEUTRAL
 from unmix_plugin.figures.paint import paint, scale_of
 from unmix_plugin.figures.pictures import Picture, TitledPicture, draw_panels, in_rows
@@ -69,15 +72,18 @@ class Evaluated:
     more: dict[str, Any]
     """What else metrics.json has."""
     num_pictures: int
-    has_materials: bool = True
-    """Whether the figures are those of `DEFINITIONS`."""
     bands: dict[str, BandErrors] = field(default_factory=dict)
-    """Of each view, where the figures are those."""
+    """Of each view, where the figures are those of `DEFINITIONS`; empty where a model measured its images itself."""
+
+    @property
+    def own(self) -> dict[str, float | None]:
+        """What a model that was measured here says of its images itself."""
+        return {name: value for name, value in self.more.get("own", {}).items() if name != "views"}
 
     def write(self, path: Path, times: Mapping[str, float | None]) -> dict[str, Any]:
         """Write metrics.json; its figures, those of training among them."""
         figures, each = {**self.figures, **times}, "per_image"
-        if self.has_materials:
+        if self.bands:
             figures, each = {name: figures[name] for name in DEFINITIONS if name in figures}, "per_view"
         content = {**figures, each: self.per_image, **self.more}
         write_file(path, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
@@ -97,7 +103,70 @@ def evaluate_images(pipeline: Pipeline, folder: Path, follow: _Follow) -> Evalua
     means = average_metrics([metrics for _, metrics in found])
     figures = {**finite_or_none(means), "views": len(pipeline.datamanager.eval_cameras)}
     per_image = [{"name": name, **finite_or_none(metrics)} for name, metrics in found]
-    return Evaluated(figures, per_image, {}, num_pictures, has_materials=False)
+    return Evaluated(figures, per_image, {}, num_pictures)
+
+
+def evaluate_spectra(pipeline: Pipeline, measured: Scene, folder: Path, follow: _Follow) -> Evaluated | None:
+    """Measure the spectra that a model names, by the same definitions as those of a scene of mixed materials.
+
+    What the model says of its images itself stands beside, as `own` and `own_per_image`, with its pictures; where it
+    draws none, prediction is drawn beside truth.
+
+    Returns:
+        What was found; None of a model that names no spectra.
+    Raises:
+        ConfigError: they are not on the scene's bands.
+    """
+    model, bands = pipeline.model, Bands.of(measured.wavelengths_nm)
+    named = (one for one in model.outputs if one.kind == "channels" and one.quantity is not None)
+    output = next(named, None)
+    if output is None:
+        return None
+    own = evaluate_images(pipeline, folder, follow)
+    truth = scene_truth(measured)
+    evaluation, num_pictures = Evaluation(truth, None), own.num_pictures
+    opacity = [one.name for one in model.outputs if one.name == "accumulation"]
+    for number, index in follow("evaluating views", list(enumerate(measured.eval_indices))):
+        with torch.no_grad(), evaluating(model):
+            camera = pipeline.datamanager.eval_cameras[number]
+            found = model.get_outputs_for_camera(camera, [output.name, *opacity])
+        spectra, view = found[output.name].cpu(), view_truth(measured, index)
+        if spectra.shape[-1] != len(bands) or (output.centers_nm and Bands.of(output.centers_nm) != bands):
+            raise ConfigError(
+                f"the output {output.name} of {type(model).__name__} has {counted(spectra.shape[-1], 'channel')}, the "
+                f"scene {bands}: spectra are measured on the scene's own bands; give one channel for each, and as "
+                "centers_nm their centres or nothing"
+            )
+        height, width = spectra.shape[:2]
+        predicted = PredictedView(
+            spectra,
+            found["accumulation"].cpu() if opacity else torch.ones(height, width),
+            torch.zeros(height, width, 0),
+            torch.full((height, width), NOTHING_ID, dtype=torch.uint8),
+            torch.zeros(height, width, 0),
+        )
+        if measured.is_rig:
+            evaluation.sensors[view.name] = measured.sensor_of(index).name
+        figures = evaluation.add(view, predicted)
+        if not opacity:
+            figures["psnr_white"] = math.nan
+        if not own.num_pictures:
+            drawn = _draw_colour(view, predicted, bands, figures["psnr"])
+            write_file(folder / "rgb" / f"{view.name}.png", drawn)
+            num_pictures += 1
+    found = _evaluated(evaluation, {"own": own.figures, "own_per_image": own.per_image}, num_pictures)
+    return replace(found, figures={name: one for name, one in found.figures.items() if one is not None})
+
+
+def _evaluated(evaluation: Evaluation, more: dict[str, Any], num_pictures: int) -> Evaluated:
+    """What was counted, as it is written."""
+    more = {"definitions": DEFINITIONS, **more}
+    per_sensor = {name: finite_or_none(found) for name, found in evaluation.per_sensor().items()}
+    more |= {"per_sensor": per_sensor} if per_sensor else {}
+    per_view = [{"name": name, **finite_or_none(found)} for name, found in evaluation.per_view.items()]
+    return Evaluated(
+        finite_or_none(evaluation.figures()), per_view, more, num_pictures, bands=evaluation.bands
+    )
 
 
 def evaluate_scene(
@@ -147,14 +216,7 @@ def evaluate_scene(
             labels = np.where(measured.valid_mask(index), labels, np.uint8(NOTHING_ID))
         drawn = _draw_matched_segmentation(name, labels, ids[index], look, matching)
         write_file(folder / "segmentation" / f"{name}.png", drawn)
-    more: dict[str, Any] = {"definitions": DEFINITIONS}
-    per_sensor = {name: finite_or_none(found) for name, found in evaluation.per_sensor().items()}
-    more |= {"per_sensor": per_sensor} if per_sensor else {}
-    more |= {"aligned": list(scene.fitted)} if scene.fitted else {}
-    per_view = [{"name": name, **finite_or_none(found)} for name, found in evaluation.per_view.items()]
-    return Evaluated(
-        finite_or_none(evaluation.figures()), per_view, more, 3 * len(ids), bands=evaluation.bands
-    )
+    return _evaluated(evaluation, {"aligned": list(scene.fitted)} if scene.fitted else {}, 3 * len(ids))
 
 
 @dataclass(frozen=True)

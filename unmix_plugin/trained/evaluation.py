@@ -264,23 +264,33 @@ class Evaluation:
     """Figures of merit of one scene, fed view by view; keeps no image."""
 
     def __init__(
-        self, truth: _SceneTruth, endmembers: Float[Tensor, "P B"], names: tuple[str, ...] | None = None
+        self,
+        truth: _SceneTruth,
+        endmembers: Float[Tensor, "P B"] | None,
+        names: tuple[str, ...] | None = None,
     ) -> None:
-        """Nothing counted yet; `endmembers` are the model's, their `names` None for `default_names`."""
+        """Nothing counted yet; `endmembers` are the model's, None of a model of spectra alone, their `names` None for
+        `default_names`."""
+        self.has_materials = endmembers is not None
+        if endmembers is None:
+            endmembers = torch.zeros(0, len(truth.bands))
         self.truth = truth
         self.names = default_names(len(endmembers)) if names is None else names
         self.endmembers = endmembers.detach().cpu().double()
         self.matching = (
-            None if truth.endmembers is None else match_endmembers(self.endmembers, truth.endmembers)
+            match_endmembers(self.endmembers, truth.endmembers)
+            if self.has_materials and truth.endmembers is not None
+            else None
         )
-        """Predicted and true endmembers, paired by spectral angle; None without true ones."""
+        """Predicted and true endmembers, paired by spectral angle; None where there are none of one kind."""
         self.per_view: dict[str, dict[str, float]] = {}
         """`_VIEW_FIGURES` of each view; NaN where it has no truth."""
         self.bands: dict[str, BandErrors] = {}
         """Of each view."""
         self.sensors: dict[str, str] = {}
         """Name of the sensor of each view of a rig."""
-        self._tally = SegmentationTally(len(endmembers), truth.num_materials) if truth.num_materials else None
+        is_scored = self.has_materials and truth.num_materials > 0
+        self._tally = SegmentationTally(len(endmembers), truth.num_materials) if is_scored else None
 
     def add(self, view: ViewTruth, predicted: PredictedView) -> dict[str, float]:
         """Count one view; its figures. A RunError where it was measured in another size than the run's camera has."""
@@ -350,7 +360,7 @@ class Evaluation:
         means = _means(self.per_view.values())
         scores, truth = self.segmentation(), self.truth
         angle = math.nan
-        if truth.endmembers is not None:
+        if self.has_materials and truth.endmembers is not None:
             angle = endmember_angle(self.endmembers, truth.endmembers)
         matched = {"miou": scores.miou, "macro_f1": scores.macro_f1, "accuracy": scores.accuracy}
         counts = {"views": len(self.per_view), "bands": len(truth.bands)}
