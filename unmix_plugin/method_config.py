@@ -58,7 +58,7 @@ def _unmix_nerf_published() -> TrainerConfig:
         method_name="unmix-nerf-published",
         max_num_iterations=30_000,
         pipeline=PipelineConfig(
-            datamanager=HyperspectralDataManagerConfig(subpixels=1),
+            datamanager=HyperspectralDataManagerConfig(subpixels=1, trust_alpha=True, mend_values=False),
             model=UnmixModelConfig(
                 endmember_init="vca",
                 specular="full",
