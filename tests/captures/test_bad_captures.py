@@ -138,6 +138,7 @@ def test_the_command_ends_with_the_users_error(tmp_path: Path, layout: str, fold
     assert message in refused(process_command, layout, *words)
 
 
+@pytest.mark.usefixtures("contact_sheet")
 def test_the_command_ends_with_the_name_of_the_scene(tmp_path: Path):
     words = ["--data", make_capture(tmp_path / "capture").root, "--output-dir", tmp_path / "scene"]
     ended = done(process_command, "cubes", *words, "--poses", "transforms.json", "--drop-bands", "500")

@@ -14,8 +14,6 @@ from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.scenes.reading.loader import load_scene
 
-pytestmark = pytest.mark.usefixtures("no_contact_sheet")
-
 MM = 0.001
 ENDS = np.array([[-0.8, 0.4, 0.2], [0.8, -0.5, -0.4]])
 """In units of the poses, on the object."""

@@ -61,7 +61,6 @@ def write_tiff(path, cube, storage="samples", **options):
     return path
 
 
-@pytest.mark.usefixtures("no_contact_sheet")
 def test_a_whole_run_decodes_each_strip_once(tmp_path, decoded):
     root = tmp_path / "capture"
     root.mkdir()

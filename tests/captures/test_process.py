@@ -34,8 +34,6 @@ from unmix_plugin.errors import CaptureError, ConfigError, RunError
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.spectral.materials import seen_reflectance
 
-pytestmark = pytest.mark.usefixtures("no_contact_sheet")
-
 
 @pytest.fixture
 def capture(tmp_path: Path):

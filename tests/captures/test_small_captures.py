@@ -37,6 +37,7 @@ def rimmed(generator, shape):
     return values
 
 
+@pytest.mark.usefixtures("contact_sheet")
 @pytest.mark.parametrize("mask", ["auto", "none"])
 @pytest.mark.parametrize(("values", "views", "side"), [
     (textured, 2, 16), (textured, 9, 16), (textured, 9, 4), (rimmed, 9, 16), (rimmed, 2, 16),

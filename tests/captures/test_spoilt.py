@@ -77,7 +77,7 @@ def spoil(root: Path, made, name: str, factor: float) -> None:
     write_cube(root, name, np.rint(counts.clip(0, 4095)).astype(np.uint16))
 
 
-@pytest.mark.usefixtures("no_contact_sheet")
+@pytest.mark.usefixtures("contact_sheet")
 def test_spoilt_views_are_left_out_and_spoil_nothing(tmp_path):
     made = make_capture(tmp_path / "capture", views=12)
     spoil(tmp_path / "capture", made, "view_03", 0.0)
@@ -107,7 +107,6 @@ def test_spoilt_views_are_left_out_and_spoil_nothing(tmp_path):
     assert kept["calibrated_value_of_1"] == 1.0  # which no single view decides
 
 
-@pytest.mark.usefixtures("no_contact_sheet")
 def test_views_are_named_by_those_that_are_there(tmp_path):
     make_capture(tmp_path / "capture")
     for option in ("leave_out", "keep_view"):
@@ -124,7 +123,6 @@ def test_files_that_can_not_be_read_stop_the_command_where_they_are_no_exception
         process(tmp_path / "capture", tmp_path / "scene")
 
 
-@pytest.mark.usefixtures("no_contact_sheet")
 def test_the_scale_does_not_follow_one_view(tmp_path):
     """Of floating-point radiance, which has no end; the bright view is too unlike the others to be another exposure."""
     root = tmp_path / "capture"

@@ -5,4 +5,9 @@ import pytest
 
 @pytest.fixture(autouse=True, scope="module")
 def nothing_is_forced_to_disk(no_wait_for_the_disk):
-    """Of scenes that are looked at once."""
+    """Of the scenes and captures here, of which most are looked at once."""
+
+
+@pytest.fixture(autouse=True)
+def only_sheets_that_are_asked_for(no_contact_sheet):
+    """Of them."""

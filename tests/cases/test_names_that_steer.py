@@ -28,6 +28,7 @@ def check_clean(*texts):
 
 
 @needs_any_name
+@pytest.mark.usefixtures("contact_sheet")
 def test_the_name_of_a_folder_and_of_its_views(tmp_path):
     root = tmp_path / f"capture{STEERS}"
     names = [f"view{STEERS}_{index:03d}" for index in range(VIEWS)]

@@ -22,8 +22,6 @@ from unmix_plugin.captures.cube import Exposure, Linear, Meaning
 from unmix_plugin.captures.fields import state_exposure
 from unmix_plugin.captures.report import Code, Kind, Remark, sentences
 
-pytestmark = pytest.mark.usefixtures("no_contact_sheet")
-
 
 @pytest.mark.parametrize(
     ("entries", "seconds"),

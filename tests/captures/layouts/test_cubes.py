@@ -113,7 +113,6 @@ def reflectances(tmp_path: Path) -> tuple[list[np.ndarray], list[str]]:
     return [np.load(tmp_path / "scene" / "cubes" / f"{name}.npy") / 65535 for name in NAMES], said
 
 
-@pytest.mark.usefixtures("no_contact_sheet")
 @pytest.mark.parametrize("names", ["WHITEDARKREF_{}", "whitedark_{}", "{}_White-Dark_Reference"])
 def test_the_dark_frame_of_the_white_is_subtracted_from_that_alone(tmp_path, names):
     """Specim IQ writes WHITEDARKREF where the white was taken before, with another exposure."""
@@ -168,7 +167,6 @@ def test_views_of_several_sizes_become_sensors(tmp_path):
     assert sizes == {name: (HEIGHT, HEIGHT - 4 if name == "view_01" else WIDTH) for name in made.reflectance}
 
 
-@pytest.mark.usefixtures("no_contact_sheet")
 def test_a_white_that_was_taken_once_serves_all_views_and_gaps_are_refused(tmp_path):
     write_tree(tmp_path / "tree")
     for path in [*tmp_path.glob("tree/*/results/*"), *tmp_path.glob("tree/214/capture/WHITEREF*")]:

@@ -31,8 +31,6 @@ from unmix_plugin.captures.options import LAYOUTS, find_views
 from unmix_plugin.errors import CaptureError, ConfigError
 from unmix_plugin.scenes.reading.loader import load_scene
 
-pytestmark = pytest.mark.usefixtures("no_contact_sheet")
-
 
 def edit(root, change):
     path = root / "transforms.json"
