@@ -186,11 +186,11 @@ def test_a_known_distance_is_kept_and_exports_say_it(solid_copy, tmp_path):
 def test_removed_matter_leaves_the_surface(solid, tmp_path):
     recipe, common = tmp_path / "recipe.yml", ["point-cloud", "--run", solid.run]
     done(export, *words(*common, "--output", tmp_path / "all"))
-    before = np.asarray(PlyData.read(tmp_path / "all" / "points.ply")["vertex"]["material"])
+    before = np.asarray(PlyData.read(tmp_path / "all" / "points.ply")["vertex"]["scalar_material"])
     material = int(np.bincount(before).argmax())
     recipe.write_text(f"edits:\n  - remove: {material}\n")
     done(export, *words(*common, "--output", tmp_path / "some", "--edits", recipe))
-    left = PlyData.read(tmp_path / "some" / "points.ply")["vertex"]["material"]
+    left = PlyData.read(tmp_path / "some" / "points.ply")["vertex"]["scalar_material"]
     assert (left == material).mean() < 0.5 * (before == material).mean()
 
 

@@ -216,10 +216,12 @@ def test_ply_and_glb_have_the_same_floats_and_vertices_the_material_of_their_hal
     shares = {f"_{name.upper()}": name for name in ABUNDANCES}
     assert set(glb.vertex_attributes) == {"_MATERIAL", *shares}
     for attribute, name in {"_MATERIAL": "material", **shares}.items():
-        np.testing.assert_array_equal(np.float32(np.ravel(glb.vertex_attributes[attribute])), vertices[name])
+        np.testing.assert_array_equal(
+            np.float32(np.ravel(glb.vertex_attributes[attribute])), vertices[f"scalar_{name}"]
+        )
     height = outside.vertices[:, 2]
-    assert (vertices["material"][height > 0.05] == 0).all()
-    assert (vertices["material"][height < -0.05] == 1).all()
+    assert (vertices["scalar_material"][height > 0.05] == 0).all()
+    assert (vertices["scalar_material"][height < -0.05] == 1).all()
 
 
 @pytest.fixture(scope="module")
@@ -249,7 +251,7 @@ def test_textures_show_the_material_of_the_place_that_they_lie_on(textured, file
     np.testing.assert_array_equal(shares[away], 255 * (height > 0)[away])
     vertices = PlyData.read(files[".ply"])["vertex"]
     colours = np.stack([vertices[name] for name in ("red", "green", "blue")], axis=1).astype(int)
-    expected = [colours[vertices[ABUNDANCES[index]].argmax()] for index in (0, 1)]
+    expected = [colours[vertices[f"scalar_{ABUNDANCES[index]}"].argmax()] for index in (0, 1)]
     found = sampled(Image.open(textured / "mesh_colour.png").convert("RGB"), uv)[away].astype(int)
     assert np.abs(found - np.where((height > 0)[away, None], *expected)).max() <= 1
     outwards = mesh.vertices - FRAME.to_world(np.zeros(3))
@@ -280,7 +282,7 @@ def test_what_shows_nothing_from_above_has_no_material(tmp_path):
     assert beside.normals[0, 0] < 0
     textures = _textures(SCENE, beside, 64)
     _write_mesh(tmp_path, ("ply", "obj"), beside, SCENE, FRAME, textures=textures)
-    assert set(PlyData.read(tmp_path / "mesh.ply")["vertex"]["material"]) == {255}
+    assert set(PlyData.read(tmp_path / "mesh.ply")["vertex"]["scalar_material"]) == {255}
     assert "usemtl material_3_nothing" in (tmp_path / "mesh.obj").read_text()
     assert (np.asarray(Image.open(io.BytesIO(textures.pictures["segmentation"]))) == 255).all()
 

@@ -155,17 +155,19 @@ def cloud(points, tmp_path_factory):
 
 
 def columns(cloud, names):
-    return np.stack([np.asarray(cloud["vertex"][name]) for name in names], axis=1)
+    known = {one.name.removeprefix("scalar_"): one.name for one in cloud["vertex"].properties}
+    return np.stack([np.asarray(cloud["vertex"][known[name]]) for name in names], axis=1)
 
 
 def test_points_are_in_the_world_of_the_scene_with_unit_normals_out_of_the_surface(cloud):
     ply, count = cloud
     assert 600 < count == ply["vertex"].count <= 800
-    what, world, size, *materials = ply.comments
+    what, world, size, *materials, scalars = ply.comments
     assert what == "surface points of an unmix-nerf run"
     assert "coordinates: world of the given poses, or of transforms.json if they were estimated" in world
     assert size == "lengths are in units of the scene, of unknown size"
-    assert materials == [f"material {index}: {name}" for index, name in enumerate(SCENE.materials.names)]
+    assert materials == [f"material id {index}: {name}" for index, name in enumerate(SCENE.materials.names)]
+    assert scalars == "properties scalar_NAME: the numbers that are called NAME here"
     outwards = columns(ply, "xyz") - FRAME.to_world(np.zeros(3))
     radii = np.linalg.norm(outwards, axis=1, keepdims=True)
     np.testing.assert_allclose(radii, RADIUS / FRAME.scale, atol=0.02 / FRAME.scale)
@@ -181,7 +183,7 @@ def test_each_point_has_material_abundances_and_the_colour_of_its_diffuse_spectr
     assert shares.dtype == np.float32
     np.testing.assert_allclose(shares.sum(axis=1), 1, atol=1e-5)
     height = FRAME.to_model(columns(ply, "xyz").astype(np.float64))[:, 2]
-    material = np.asarray(ply["vertex"]["material"])
+    material = np.asarray(ply["vertex"]["scalar_material"])
     assert (material[height > 0.05] == 0).all()
     assert (material[height < -0.05] == 1).all()
     top = np.flatnonzero(shares[:, 0] == 1)[0]
@@ -201,7 +203,7 @@ def test_indices_targets_and_nearest_spectra_are_written_for_each_point(points, 
     path = tmp_path / "points.ply"
     count = _write_point_cloud([path], points, 300, SCENE, FRAME, scores)
     ply = PlyData.read(path)
-    written = [one.name for one in ply["vertex"].properties[-4:]]
+    written = [one.name.removeprefix("scalar_") for one in ply["vertex"].properties[-4:]]
     assert written == ["index_1", "index_pri", "target_1", "library_1"]
     found = columns(ply, written)
     assert found.dtype == np.float32
@@ -209,14 +211,14 @@ def test_indices_targets_and_nearest_spectra_are_written_for_each_point(points, 
     shares = columns(ply, property_names(SCENE.materials.names))
     seen = shares @ spectra
     np.testing.assert_allclose(found[:, 0], seen[:, 4] / seen[:, 1], rtol=1e-4)
-    material = np.asarray(ply["vertex"]["material"])
+    material = np.asarray(ply["vertex"]["scalar_material"])
     pure = shares.max(axis=1) > 0.999
     np.testing.assert_array_equal(found[pure, 2], material[pure] == 0)
     known = pure & (material < 2)
     np.testing.assert_array_equal(found[known, 3], 1 - material[known])
-    assert "index_1: index:r650/r500, formula r650/r500" in ply.comments[-6]
-    assert ply.comments[-6].endswith("of radiance, since the scene's light is unknown")
-    assert ply.comments[-2:] == ["library_1 0: moss", "library_1 1: red clay"]
+    assert "index_1: index:r650/r500, formula r650/r500" in ply.comments[-7]
+    assert ply.comments[-7].endswith("of radiance, since the scene's light is unknown")
+    assert ply.comments[-3:-1] == ["library_1 0: moss", "library_1 1: red clay"]
 
 
 @pytest.mark.parametrize("suffix", ["las", "laz"])
@@ -234,12 +236,15 @@ def test_las_has_the_numbers_of_ply_with_all_bands_and_abundances(suffix, points
     np.testing.assert_allclose(las.xyz, position, atol=1e-6 * np.ptp(position))
     np.testing.assert_array_equal(np.asarray(las.red) // 257, ply["red"])
     names = {name for name in ply.dtype.names if name not in ("x", "y", "z", "red", "green", "blue")}
-    assert set(las.point_format.extra_dimension_names) == names
-    bands = [f"reflectance_{nm:g}nm" for nm in BANDS.centers_nm]
+    # CloudCompare opens extra dimensions of LAS as they are, and of PLY what is called scalar_NAME, as NAME.
+    numbers = {name for name in names if name not in ("nx", "ny", "nz")}
+    assert all(name.startswith("scalar_") for name in numbers)
+    assert set(las.point_format.extra_dimension_names) == {name.removeprefix("scalar_") for name in names}
+    bands = [f"scalar_reflectance_{nm:g}nm" for nm in BANDS.centers_nm]
     assert set(bands) < names
     for name in names:
-        np.testing.assert_array_equal(np.asarray(las[name]), ply[name])
-    shares = np.stack([ply[name] for name in ply.dtype.names if name.startswith("abundance_")], axis=1)
+        np.testing.assert_array_equal(np.asarray(las[name.removeprefix("scalar_")]), ply[name])
+    shares = np.stack([ply[name] for name in ply.dtype.names if name.startswith("scalar_abundance_")], axis=1)
     scene = lit.materials.endmembers.numpy() / light.numpy()
     found = np.stack([ply[name] for name in bands], axis=1)
     angles = (

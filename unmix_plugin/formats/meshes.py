@@ -31,6 +31,9 @@ from unmix_plugin.formats.files import write_file
 from unmix_plugin.limits import MOST_TABLE_BYTES, read_bounded
 from unmix_plugin.spectral.colour.srgb import decode_srgb
 
+_STANDARD = ("x", "y", "z", "nx", "ny", "nz", "red", "green", "blue")
+"""Properties of a PLY that every program knows."""
+_SCALAR = "scalar_"
 _TYPES = {"float32": "float", "float64": "double", "uint8": "uchar", "int32": "int"}
 _FLOAT, _UNSIGNED_INT = 5126, 5125
 _VERTEX_BUFFER, _INDEX_BUFFER = 34962, 34963
@@ -43,6 +46,18 @@ _READ_TYPES |= {"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short
 _READ_TYPES |= {"ushort": "u2", "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4"}
 
 
+def with_scalar_fields(
+    vertices: Mapping[str, np.ndarray], comments: Sequence[str]
+) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Properties and comments of a PLY whose numbers CloudCompare opens as scalar fields without being asked: it takes
+    those named `scalar_NAME`, and calls them NAME.
+
+    Source: CloudCompare, libs/qCC_io/src/PlyFilter.cpp.
+    """
+    named = {name if name in _STANDARD else f"{_SCALAR}{name}": values for name, values in vertices.items()}
+    return named, [*comments, f"properties {_SCALAR}NAME: the numbers that are called NAME here"]
+
+
 def write_ply(
     path: Path,
     vertices: Mapping[str, np.ndarray],
@@ -53,8 +68,8 @@ def write_ply(
 
     Args:
         path: File; its folder is made.
-        vertices: Properties by name (x, y, z, nx, ny, nz, red, green, blue have a known meaning), each (P,) of float32,
-            float64, uint8 or int32.
+        vertices: Properties by name (those of `_STANDARD` have a known meaning), each (P,) of float32, float64, uint8
+            or int32.
         faces, comments: Indices of vertices, and lines of the header.
     Raises:
         KeyError: a property of another type.

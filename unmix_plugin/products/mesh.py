@@ -25,7 +25,15 @@ from unmix_plugin.formats.files import (
     rgba_png_bytes,
     write_file,
 )
-from unmix_plugin.formats.meshes import obj_paths, turn_to_y, turned_by, write_glb, write_obj, write_ply
+from unmix_plugin.formats.meshes import (
+    obj_paths,
+    turn_to_y,
+    turned_by,
+    with_scalar_fields,
+    write_glb,
+    write_obj,
+    write_ply,
+)
 from unmix_plugin.products.atlas import Atlas, texels_of, unwrap
 from unmix_plugin.products.product import Job
 from unmix_plugin.products.scene_products import Mesh
@@ -184,7 +192,8 @@ def _write_mesh(
         path = _paths(folder, kind)[0]
         if kind == "ply":
             vertices = xyz_columns(world.vertices) | xyz_columns(turned, "n") | looks.properties()
-            written.append(write_ply(path, vertices, world.faces, looks.comments(_WHAT)))
+            named, comments = with_scalar_fields(vertices, looks.comments(_WHAT))
+            written.append(write_ply(path, named, world.faces, comments))
         elif kind == "obj":
             written += _write_obj(path, world, turned, looks, axis, textures)
         else:

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from unmix_plugin.errors import ConfigError, RunError, counted
 from unmix_plugin.formats.las import require_laspy, write_las
-from unmix_plugin.formats.meshes import write_ply
+from unmix_plugin.formats.meshes import with_scalar_fields, write_ply
 from unmix_plugin.products.mesh import xyz_columns
 from unmix_plugin.products.product import Job
 from unmix_plugin.products.scene_products import PointCloud
@@ -243,5 +243,6 @@ def _write_point_cloud(
         if path.suffix in (".las", ".laz"):
             write_las(path, vertices, comments)
         else:
-            write_ply(path, vertices, comments=comments)
+            named, said = with_scalar_fields(vertices, comments)
+            write_ply(path, named, comments=said)
     return len(chosen)

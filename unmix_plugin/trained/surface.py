@@ -331,7 +331,7 @@ class SurfaceAppearance:
     def comments(self, what: str) -> list[str]:
         """What a file says of itself."""
         colours = describe_colour(self.materials.bands)
-        materials = [f"material {index}: {name}" for index, name in enumerate(self.materials.names)]
+        materials = [f"material id {index}: {name}" for index, name in enumerate(self.materials.names)]
         return [
             what,
             f"coordinates: world of the given poses, or of transforms.json if they were estimated; {colours}",
