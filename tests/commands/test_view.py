@@ -106,7 +106,7 @@ def test_a_path_becomes_a_video_of_the_edited_scene(run_copy):
     with served(run_copy) as (_, page):
         wait_for_control(page, "render a video")
         add_key_frames(page, 0.3, 0.6)
-        page.set("light", "A: light bulb")
+        page.set("light", "A: incandescent lamp, 2856 K")
         for label, value in (("width", 33), ("height", 32), ("seconds", 0.5), ("frames a second", 6)):
             page.set(label, value)
         page.wait_until(lambda: "illuminant: A" in page.controls[page.control("recipe")]["value"])

@@ -142,7 +142,7 @@ def test_a_run_is_looked_at_probed_edited_and_saved(viewer, browser):
 
     browser.open_tab("materials")
     shown = browser.picture()
-    browser.choose("light", "A: light bulb")
+    browser.choose("light", "A: incandescent lamp, 2856 K")
     shown = browser.wait_for_other(shown)
     browser.keep("edited")
     page.get_by_role("button", name="save", exact=True).click()

@@ -187,7 +187,7 @@ def test_kept_regions_are_shown_by_name_with_area_mean_spread_and_mixture(opened
 
 def test_a_band_is_reflectance_only_in_a_light_of_1(opened):
     opened.evaluate("unmixPage.choose('band')")
-    for light, quantity in (("D65", "radiance"), ("the scene's own", "reflectance")):
+    for light, quantity in (("D65: noon daylight, 6504 K", "radiance"), ("the scene's own", "reflectance")):
         opened.select_option("#light", label=light)
         opened.wait_for_function(f"document.getElementById('about').textContent.startsWith('{quantity} at')")
 

@@ -129,7 +129,7 @@ def test_the_point_cloud_follows_the_light_and_shows_no_hidden_material(viewer, 
     monkeypatch.setattr(SceneApi, "add_point_cloud", noted)
     page.set("point cloud")
     page.wait_until(lambda: len(clouds) == 1)
-    page.set("light", "A: light bulb")
+    page.set("light", "A: incandescent lamp, 2856 K")
     recipe = page.props("recipe")
     page.wait_until(lambda: len(clouds) == 2 and "illuminant: A" in recipe["value"])
     (points, colours), (same, relit) = clouds
@@ -509,7 +509,10 @@ def test_what_a_user_has_to_know_of_an_edit_is_said_once(page):
     page.set("colour", (120, 110, 100))
     page.wait_until(lambda: bool(page.notices))
     recipe = page.props("recipe")
-    for label, value, written in (("brightness", 2.0, "scale"), ("light", "A: light bulb", "illuminant: A")):
+    for label, value, written in (
+        ("brightness", 2.0, "scale"),
+        ("light", "A: incandescent lamp, 2856 K", "illuminant: A"),
+    ):
         page.set(label, value)
         page.wait_until(lambda written=written: written in recipe["value"])
     show_layer(page, "depth")
@@ -527,7 +530,7 @@ def test_the_axis_of_spectra_says_reflectance_only_in_a_light_of_1(tmp_path):
     with serving(source) as (viewer, _), opened(viewer) as page:
         page.click(0.5, 0.5)
         page.wait_until(lambda: axes(page) == ["reflectance"] * 3)  # of materials, the probe, all probes
-        page.set("light", "A: light bulb")
+        page.set("light", "A: incandescent lamp, 2856 K")
         page.wait_until(lambda: axes(page) == ["radiance", "reflectance", "reflectance"])
         page.click(0.5, 0.5)  # the first probe keeps its light
         page.wait_until(lambda: axes(page) == ["radiance", "radiance", "radiance or reflectance"])

@@ -166,6 +166,29 @@ LightName: TypeAlias = str | Path
 """Name of a known light (`spectral.colour.conversion.illuminant_names`), or a CSV file, wavelength,power."""
 
 
+COMMON_LIGHTS = {
+    "D65": "noon daylight, 6504 K",
+    "D50": "warmer daylight, 5003 K, as for prints",
+    "A": "incandescent lamp, 2856 K",
+    "E": "equal energy at all wavelengths",
+    "C": "daylight, 6774 K, as taken before D65",
+    "FL2": "cool white fluorescent lamp, 4230 K",
+    "FL7": "daylight fluorescent lamp, 6500 K",
+    "FL11": "narrow-band fluorescent lamp, 4000 K",
+    "LED-B3": "white LED, 4103 K",
+}
+"""Names of usual lights, and what they are in words. Source: CIE 15:2018."""
+
+
+def light_title(name: str) -> str:
+    """A light as menus call it.
+
+    >>> light_title("A"), light_title("lamp")
+    ('A: incandescent lamp, 2856 K', 'lamp')
+    """
+    return f"{name}: {COMMON_LIGHTS[name]}" if name in COMMON_LIGHTS else name
+
+
 @dataclass(frozen=True)
 class Light:
     """What a scene is lit by."""

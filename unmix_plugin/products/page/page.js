@@ -252,7 +252,7 @@
   ];
   const litLayers = relit ? ["colour"] : ["colour", "band", "false"];
   layers.forEach(([value, text]) => $("layer").append(make("option", { value, text })));
-  facts.lights.forEach((light, value) => $("light").append(make("option", { value, text: light.name })));
+  facts.lights.forEach((light, value) => $("light").append(make("option", { value, text: light.title ?? light.name })));
 
   const paintLight = (matrix) => {
     const factors = facts.lights[relit ? 0 : $("light").value].factors;

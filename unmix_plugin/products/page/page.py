@@ -30,7 +30,7 @@ from torch.nn.functional import normalize
 
 from unmix_plugin import __version__
 from unmix_plugin.editing.apply import relighting_factors
-from unmix_plugin.editing.recipe import Light
+from unmix_plugin.editing.recipe import Light, light_title
 from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.figures.paint import colour_table
 from unmix_plugin.formats.files import eight_bits, write_file
@@ -258,7 +258,9 @@ def _spectral_facts(materials: Materials | None, recorded: Sequence[float] | Non
     bands, power = materials.bands, _light_of(materials)
     endmembers = materials.endmembers.detach().cpu().double().numpy()
     own, shown, dark = "the scene's own", materials.light_name, list[str]()
-    lights = [{"name": shown or own, "factors": [1.0] * len(bands), "notes": []}]
+    lights = [
+        {"name": shown or own, "title": light_title(shown or own), "factors": [1.0] * len(bands), "notes": []}
+    ]
     if shown is not None and materials.sensor is None:  # whose channels the recorded light is not known in
         assert power is not None
         before = np.ones(len(bands)) if recorded is None else np.array(recorded, dtype=np.float64)
@@ -273,7 +275,9 @@ def _spectral_facts(materials: Materials | None, recorded: Sequence[float] | Non
         except SpectrumError:
             continue  # it does not reach these bands: not offered
         notes = [*dark, *notes[len(dark) :]]  # the first takes the light shown for the scene's own
-        lights.append({"name": light, "factors": rounded(factors), "notes": notes})
+        lights.append(
+            {"name": light, "title": light_title(light), "factors": rounded(factors), "notes": notes}
+        )
     return {
         "wavelengths_nm": rounded(bands.centers_nm),
         "ranges_nm": rounded(bands.ranges_nm),

@@ -24,6 +24,7 @@ from unmix_plugin.editing import (
     read_recipe,
     recipe_to_yaml,
 )
+from unmix_plugin.editing.recipe import COMMON_LIGHTS, light_title
 from unmix_plugin.errors import ConfigError, UnmixError
 from unmix_plugin.formats.files import write_file
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
@@ -73,17 +74,6 @@ def likeness_rows(
 _NO_RECIPE = "none saved yet"
 _NO_MATERIAL = "choose one"
 _OWN_LIGHT = "as recorded"
-_COMMON_LIGHTS = {
-    "D65": "daylight at noon",
-    "D50": "warmer daylight, as for prints",
-    "A": "light bulb",
-    "E": "the same at all wavelengths",
-    "C": "daylight, as taken before D65",
-    "FL2": "cool white fluorescent lamp",
-    "FL7": "daylight fluorescent lamp",
-    "FL11": "shop light, in narrow bands",
-}
-"""Names of usual lights, and what they are in words."""
 _FACTORS = (0.0, 5.0, 0.05, 1.0)
 """Least, greatest, step and first of a slider."""
 
@@ -317,13 +307,9 @@ class MaterialsPanel:
         """Lights to choose from, by how the menu has them: the recorded one, those that reach the bands, usual ones
         first, and the present one in any case."""
         usable = self._session.services.usable_lights
-        names = [name for name in _COMMON_LIGHTS if name in usable]
+        names = [name for name in COMMON_LIGHTS if name in usable]
         names += [*usable, *([] if present is None else [str(present.light)])]
-        titles = {
-            f"{name}: {_COMMON_LIGHTS[name]}" if name in _COMMON_LIGHTS else name: name
-            for name in dict.fromkeys(names)
-        }
-        return {_OWN_LIGHT: None, **titles}
+        return {_OWN_LIGHT: None, **{light_title(name): name for name in dict.fromkeys(names)}}
 
 
 def _srgb(value: Any) -> tuple[float, float, float]:
