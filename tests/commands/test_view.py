@@ -124,7 +124,7 @@ def test_a_run_is_shown_with_the_edits_and_the_light_asked_for(run_copy):
     recipe.write_text("edits:\n  - rename: {endmember: endmember_1, name: clay}\n")
     with served(run_copy, edits=recipe, illuminant="fl2") as (_, page):
         wait_for_control(page, "render a video")
-        assert page.controls[page.control("light")]["value"] == "FL2: cool white fluorescent lamp"
+        assert page.controls[page.control("light")]["value"] == "FL2: cool white fluorescent lamp, 4230 K"
         assert "clay" in page.controls[page.control("other endmember")]["options"]
         page.set("changes", "start again")
         page.wait_until(lambda: page.controls[page.control("light")]["value"] == "as recorded")

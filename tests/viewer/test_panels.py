@@ -365,7 +365,7 @@ CHANGES = (
     ("name", "clay", "name: clay"),
     ("replace by the known material", True, "library: ColorChecker/red"),
     ("swap with the other", True, "swap: [0, 2]"),
-    ("light", "FL2: cool white fluorescent lamp", "illuminant: FL2"),
+    ("light", "FL2: cool white fluorescent lamp, 4230 K", "illuminant: FL2"),
 )
 
 
