@@ -20,7 +20,7 @@ COMMANDS = {
     "evaluate": ["--run", "nowhere"],
     "export": ["poses", "--run", "nowhere"],
     "image": ["nowhere.hdr"],
-    "process": ["cubes", "--data", "scene", "--output-dir", "out"],
+    "process": ["cubes", "--data", "scene", "--output", "out"],
     "demo_scene": ["made", "--size", "64", "--overwrite"],
     "view": ["--run", "nowhere"],
 }

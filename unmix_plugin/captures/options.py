@@ -51,7 +51,7 @@ class ProcessOptions:
     """How the files of the capture are laid out."""
     data: Path
     """Folder of the capture."""
-    output_dir: Path
+    output: Path
     """Folder to write the scene to; it appears when the scene is complete."""
     poses: str | None = None
     """Where the cameras were: a file or folder of another program (transforms.json, COLMAP, Metashape, ...); or found
