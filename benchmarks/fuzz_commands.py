@@ -29,8 +29,8 @@ import tyro
 
 sys.path.insert(0, str(_common.REPOSITORY))  # for makers of captures and damage, which lie with the tests
 
-from tests.commands.conftest import small_run
 from tests.factories import captures, data_sets, rig_flight
+from tests.factories.runs import small_run
 from tests.fuzz.capture_samples import ENVI_DATA, SAMPLES
 from tests.fuzz.mutation import mutate_bytes, mutate_json, mutate_png
 from unmix_plugin.commands.entry import run_command

@@ -98,17 +98,21 @@ SPOILT = {
     "root of no kind": (in_scene("summary", root=7), "Expected `str`, got `int` - at `$.root`"),
 }
 
+BY_EVERY_COMMAND = ("settings of an old version", "tensors of NaN", "scene.json cut off", "circle of links")
+ON_EACH_WAY = [one for one in COMMANDS if one[0] in (evaluate, train)]
+"""To look at a run, as all commands but one open it, and to go on with it."""
+
 
 def contents(path):
     return {file: file.read_bytes() for file in path.rglob("*") if file.is_file()}
 
 
 @pytest.mark.parametrize("spoil", SPOILT)
-def test_a_spoilt_run_folder_is_refused_by_every_command_and_left_alone(run_copy, spoil):
+def test_a_spoilt_run_folder_is_refused_and_left_alone(run_copy, spoil):
     change, said = SPOILT[spoil]
     change(run_copy)
     before = contents(run_copy)
-    for command, words in COMMANDS:
+    for command, words in COMMANDS if spoil in BY_EVERY_COMMAND else ON_EACH_WAY:
         assert said in refused(command, *words, run_copy)
     after = contents(run_copy)
     after.pop(run_copy / "run.log")

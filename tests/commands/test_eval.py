@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import torch
 
-from tests.commands.conftest import small_run
 from tests.factories.commands import done, picture_size, refused
+from tests.factories.runs import small_run
 from unmix_plugin.commands.eval import evaluate
 from unmix_plugin.engine.processes import ALONE
 from unmix_plugin.engine.runs.load_run import load_pipeline

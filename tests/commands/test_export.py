@@ -14,12 +14,12 @@ import pytest
 import torch
 from plyfile import PlyData
 
-from tests.commands.conftest import PRODUCT_NAMES
-from tests.commands.conftest import export_words as words
 from tests.engine.conftest import registered, short_config  # noqa: F401 (fixtures)
 from tests.factories.commands import done, picture_size, refused, run
 from tests.factories.outputs import loaded_mesh
 from tests.factories.pages import assert_self_contained
+from tests.factories.runs import PRODUCT_NAMES, lose_scene
+from tests.factories.runs import export_words as words
 from tests.factories.trainings import finished
 from unmix_plugin.commands.export import export
 from unmix_plugin.engine import registry
@@ -131,14 +131,11 @@ def test_a_file_is_replaced_only_by_overwrite_also_edited_and_relit(solid, expor
         assert "Worst views" not in page
 
 
-def test_every_product_comes_from_the_run_folder_alone(solid, solid_copy, tmp_path):
-    shutil.move(solid.scene, tmp_path / "elsewhere")
-    try:
-        for name in PRODUCT_NAMES:
-            done(export, *words(name, "--run", solid_copy))
-            assert list((solid_copy / "exports" / name).glob("[!.]*"))
-    finally:
-        shutil.move(tmp_path / "elsewhere", solid.scene)
+def test_every_product_comes_from_the_run_folder_alone(solid, solid_copy):
+    lose_scene(solid_copy, solid.scene)
+    for name in PRODUCT_NAMES:
+        done(export, *words(name, "--run", solid_copy))
+        assert list((solid_copy / "exports" / name).glob("[!.]*"))
     with (solid_copy / "exports/spectrum/eval_002_x8_y8.csv").open() as file:
         heads = next(csv.reader(file))
     assert [head for head in heads if not head.endswith(("_low", "_high"))] == [

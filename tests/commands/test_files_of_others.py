@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.commands.conftest import PRODUCT_NAMES, export_words
 from tests.factories.captures import make_capture
 from tests.factories.commands import done, run
 from tests.factories.mixtures import smooth_endmembers
+from tests.factories.runs import PRODUCT_NAMES, export_words
 from tests.factories.systems import needs_posix
 from tests.spectral.unmixing.test_image import image_of
 from unmix_plugin import open_run, save
@@ -143,14 +143,11 @@ def test_of_a_run(trained, exported, run_copy, tmp_path, way):
     if way != "links":  # out of the run, which is refused
         require_kept(names, run_copy / "eval", way, evaluate, "--run", run_copy, "--device", "cpu")
         shutil.rmtree(run_copy / "eval")
-        pair = (evaluate, trained.run, run_copy, "--device", "cpu")
+        first = Path(shutil.copytree(trained.run, tmp_path / "first" / trained.run.name))
+        pair = (evaluate, first, run_copy, "--device", "cpu")
         done(*pair)
-        comparison = trained.run / "exports" / "comparison"
-        try:
-            require_kept([*written(comparison), "rgb/mine.png"], comparison, way, *pair)
-        finally:
-            shutil.rmtree(trained.run / "exports")
-            shutil.rmtree(trained.run / "eval")
+        comparison = first / "exports" / "comparison"
+        require_kept([*written(comparison), "rgb/mine.png"], comparison, way, *pair)
 
 
 def test_of_a_saved_view(trained, tmp_path):

@@ -1,7 +1,6 @@
 """`unmix-render`: that files are the model's, from any camera, edited or not, and that nothing is lost."""
 
 import json
-import shutil
 
 import numpy as np
 import pytest
@@ -9,6 +8,7 @@ import pytest
 from tests.factories.commands import done, refused, run
 from tests.factories.outputs import read_video
 from tests.factories.renders import read_envi, read_exr
+from tests.factories.runs import lose_scene
 from unmix_plugin.commands.render import render
 from unmix_plugin.editing.edited_run import load_edited_run
 from unmix_plugin.engine import processes
@@ -55,12 +55,9 @@ def test_a_map_without_coordinates_is_said_to_have_none(trained, tmp_path):
         assert ("map info" in header) != has_none
 
 
-def test_renders_go_into_the_run_by_default_and_need_nothing_else(trained, run_copy, tmp_path):
-    shutil.move(trained.scene, tmp_path / "elsewhere")
-    try:
-        done(render, "--run", run_copy, "--outputs", "rgb")
-    finally:
-        shutil.move(tmp_path / "elsewhere", trained.scene)
+def test_renders_go_into_the_run_by_default_and_need_nothing_else(trained, run_copy):
+    lose_scene(run_copy, trained.scene)
+    done(render, "--run", run_copy, "--outputs", "rgb")
     assert (run_copy / "exports" / "render" / "rgb" / "eval_006.png").is_file()
 
 

@@ -23,7 +23,7 @@ from unmix_plugin.commands.train import train
 from unmix_plugin.engine import PipelineConfig, load_model
 from unmix_plugin.neumatex.export import pbr_fit
 from unmix_plugin.neumatex.export.material import material_paths
-from unmix_plugin.neumatex.fit import data_manager, start
+from unmix_plugin.neumatex.fit import start
 from unmix_plugin.neumatex.fit.data_manager import ObjectDataManagerConfig
 from unmix_plugin.neumatex.fit.model import NeumatexModel, unbiased_squared_error
 from unmix_plugin.neumatex.fit.settings import NeumatexModelConfig
@@ -40,15 +40,6 @@ from unmix_plugin.viewer.rendering.settings import LayerSettings
 
 PBR, NO_PRIOR = "--pipeline.model.material=pbr", "--pipeline.model.prior=none"
 SPECTRAL = ["--pipeline.model.material=spectral", "--pipeline.model.num-endmembers=2"]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def few_pixels():
-    """A ball of two materials needs few pixels to start from."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(data_manager, "_NUM_PIXELS", 2000)
-        patch.setattr(start, "_POINTS", 512)
-        yield
 
 
 @pytest.fixture(scope="module")

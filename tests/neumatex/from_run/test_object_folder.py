@@ -8,7 +8,7 @@ import pytest
 import torch
 import trimesh
 
-from tests.factories.commands import done, refused, run_of
+from tests.factories.commands import SMALL_METHOD, done, refused, run_of
 from tests.factories.objects import (
     CENTRE,
     LAMP,
@@ -28,7 +28,10 @@ from unmix_plugin.neumatex.from_run.object_folder import ObjectRecipe, object_of
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.trained.open_run import open_run
 
+SHORT = ["--endmembers", 2, "--poses", "fixed", "--pipeline.model.initial-opacity", 0.6, *SMALL_METHOD]
 WORDS = ["--endmembers", 2, "--device", "cpu", "--poses", "fixed", "--max-num-iterations", 60]
+WORDS += ["--pipeline.datamanager.grid-resolution", 32, "--pipeline.model.samples-per-step", 8000]
+"""From which a run knows where the ball is."""
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +72,8 @@ def load_cube(scene, index):
 
 
 def test_exposures_that_training_found_are_undone_in_its_views(ball, tmp_path):
-    words = ["--data", ball[0], "--output-dir", tmp_path, *WORDS, "--light", "per-view"]
+    words = ["--data", ball[0], "--output-dir", tmp_path, *SHORT, "--max-num-iterations", 20]
+    words += ["--light", "per-view"]
     run, said = run_of(done(train, "unmix-nerf", *words)), list[str]()
     folder = object_of_run(ObjectRecipe(run, 300), said.append)
     assert any("exposures that training found are undone" in line for line in said)
@@ -156,7 +160,8 @@ def test_light_is_estimated_where_none_is_given_and_said_to_be_unknown_where_it_
 
 
 def test_a_lamp_that_moves_with_the_camera_is_refused(ball, tmp_path):
-    words = ["--data", ball[0], "--output-dir", tmp_path, *WORDS[:-1], 1, "--light", "camera"]
+    words = ["--data", ball[0], "--output-dir", tmp_path, *SHORT, "--max-num-iterations", 1]
+    words += ["--light", "camera"]
     run = run_of(done(train, "unmix-nerf", *words))
     with pytest.raises(ConfigError, match="moves with the camera"):
         object_of_run(ObjectRecipe(run, 400), lambda _: None)
