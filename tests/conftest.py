@@ -45,3 +45,10 @@ def no_contact_sheet(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyP
     """Scenes are written without one where no test asks for it: drawing takes longer than all else of small ones."""
     if "contact_sheet" not in request.fixturenames:
         monkeypatch.setattr("unmix_plugin.captures.writing.scene_files.contact_sheet", lambda *_: b"")
+
+
+@pytest.fixture
+def few_searches(monkeypatch: pytest.MonkeyPatch):
+    """A shorter pooled search for endmembers, where a test does not ask how good they are."""
+    for name, value in (("_REPEATS", 1), ("_OUTER_STEPS", 6), ("_PURITY_PRICES", (0.0, 0.1, 0.3))):
+        monkeypatch.setattr(f"unmix_plugin.spectral.unmixing.pooled_search.{name}", value)

@@ -17,6 +17,7 @@ from unmix_plugin.errors import SpectrumError
 from unmix_plugin.formats.envi import write_envi_cube
 from unmix_plugin.spectral.bands import Bands
 
+pytestmark = pytest.mark.usefixtures("few_searches")
 UNKNOWN_LIGHT = "does not say that it holds reflectance. If it does not, the light of the scene is unknown"
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -105,18 +106,28 @@ ROOMS = {
 }
 
 
+@pytest.fixture(scope="module")
+def room_named(tmp_path_factory) -> Callable[[str], Scene]:
+    """Each room, made once."""
+
+    @lru_cache
+    def made(name: str) -> Scene:
+        walls, cameras = ROOMS[name]
+        return scene_of(tmp_path_factory.mktemp("room"), walls=walls, cameras=cameras)
+
+    return made
+
+
 @pytest.mark.parametrize("name", ROOMS)
-def test_plain_walls_of_a_closed_room_are_no_backdrop(tmp_path, name):
-    walls, cameras = ROOMS[name]
-    scene = scene_of(tmp_path, walls=walls, cameras=cameras)
+def test_plain_walls_of_a_closed_room_are_no_backdrop(room_named, name):
+    scene = room_named(name)
     assert not scene.has_backdrop
     assert any(one.subject == "backdrop" and one.outcome == "none" for one in scene.decisions)
 
 
 @pytest.mark.parametrize("name", ["white", "white between red walls"])
-def test_what_looks_like_a_backdrop_is_tried_against_its_masks(tmp_path, name):
-    walls, cameras = ROOMS[name]
-    scene = scene_of(tmp_path, walls=walls, cameras=cameras)
+def test_what_looks_like_a_backdrop_is_tried_against_its_masks(room_named, name):
+    scene = room_named(name)
     assert find_before_backdrop(training_views(scene)) is not None  # by looks alone it is one
     [decision] = [one for one in scene.decisions if one.subject == "backdrop"]
     assert decision.outcome == "none"
@@ -127,9 +138,8 @@ def test_what_looks_like_a_backdrop_is_tried_against_its_masks(tmp_path, name):
 
 
 @pytest.mark.parametrize("name", ["white, from above", "cyan, from above"])
-def test_a_room_whose_masks_agree_is_told_by_the_distance_of_its_walls(tmp_path, name):
-    walls, cameras = ROOMS[name]
-    views = training_views(scene_of(tmp_path, walls=walls, cameras=cameras))
+def test_a_room_whose_masks_agree_is_told_by_the_distance_of_its_walls(room_named, name):
+    views = training_views(room_named(name))
     before = present(find_before_backdrop(views))
     distance = measure_distance(views, before)
     assert distance.far > 0.5  # neither directions nor pixels tell what a view shows
