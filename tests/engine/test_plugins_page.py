@@ -18,6 +18,7 @@ from unmix_plugin.commands.render import render
 from unmix_plugin.commands.train import train
 from unmix_plugin.engine import Output, outputs, registry
 from unmix_plugin.engine.runs.load_run import load_model
+from unmix_plugin.formats.envi import read_header
 from unmix_plugin.scenes.demo.scene import make_demo_scene
 
 PAGE = (Path(__file__).parents[2] / "docs" / "guides" / "plugins.md").read_text(encoding="utf-8")
@@ -68,6 +69,14 @@ def test_the_example_of_the_page_imports_public_names_only_trains_and_is_evaluat
     rows = {row.split(",")[0]: row.split(",")[1:3] for row in table}
     assert {"psnr", "ssim", "sam"} <= {name for name, values in rows.items() if all(values)}
     assert rows["miou"][0] == "" != rows["miou"][1]
+
+    done(
+        render, "--run", path, "--output", tmp_path / "banded", "--device", "cpu", "--formats", "envi", "exr"
+    )
+    folder, nm = tmp_path / "banded" / "spectral", loaded.model.metadata["wavelengths_nm"]
+    header = read_header(next(folder.glob("*.hdr")))
+    assert [float(one) for one in header["wavelength"].split(",")] == pytest.approx(nm)
+    assert next(folder.glob("*.exr")).read_bytes().count(b"S0.") >= len(nm)
 
     spectral, *_ = module.SpectralGrid.outputs
     monkeypatch.setattr(module.SpectralGrid, "outputs", (replace(spectral, centers_nm=(1.0, 2.0, 3.0, 4.0)),))

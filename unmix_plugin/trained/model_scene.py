@@ -132,7 +132,9 @@ def model_scene(
             "unmix_plugin.engine.Output (docs/guides/plugins.md, What other methods get)"
         )
     still = copy.deepcopy(model, frozen_parameters(model, averages)).eval()  # type: ignore[arg-type]
-    return ModelScene(still, world_frame(record), recorded_views(record), still.outputs)
+    nm = model.metadata.get("wavelengths_nm")
+    bands = None if nm is None else Bands.of(nm)
+    return ModelScene(still, world_frame(record), recorded_views(record), still.outputs, bands=bands)
 
 
 def frozen_parameters(model: Model, averages: Mapping[str, Tensor] | None) -> dict[int, nn.Parameter]:

@@ -262,12 +262,16 @@ def setting_for(
             names[output.name] = ("x", "y", "z") if output.kind == "vectors" else ("red", "green", "blue")
             continue
         of_output = Bands.of(output.centers_nm) if output.centers_nm else scene.bands
+        count = 0
+        if materials is None and not output.centers_nm:
+            count = scene.render(one_pixel(camera, 0, 0), [output.name])[output.name].shape[-1]
+            if of_output is not None and (output.quantity is None or count != len(of_output)):
+                of_output = None  # its channels are not the scene's bands
         if output.kind != "shares" and of_output is not None:
             bands[output.name] = of_output
             names[output.name] = tuple(f"{wavelength:g} nm" for wavelength in of_output.centers_nm)
         elif materials is None:
-            pixel = scene.render(one_pixel(camera, 0, 0), [output.name])[output.name]
-            names[output.name] = tuple(f"{output.title} {index}" for index in range(pixel.shape[-1]))
+            names[output.name] = tuple(f"{output.title} {index}" for index in range(count))
         else:
             names[output.name] = materials.names
     return RenderSetting(folder, camera.size(0), survey.ranges, bands, names)
