@@ -26,7 +26,6 @@ from unmix_plugin.trained.measured_surface import MeasuredSurface
 from unmix_plugin.trained.measures import scale_between
 from unmix_plugin.trained.open_run import open_run
 from unmix_plugin.trained.regions import Box
-from unmix_plugin.trained.surface_mesh import surface_of
 from unmix_plugin.trained.trained_scene import TrainedScene
 
 METRES = 0.1
@@ -130,7 +129,7 @@ def lengths(scene: TrainedScene, pairs: list[tuple[np.ndarray, np.ndarray]]) -> 
 def areas(scene: TrainedScene) -> dict[str, dict[str, Any]]:
     """Areas of the parts in square centimetres, and their errors."""
     assert scene.scale is not None
-    surface = MeasuredSurface(scene, surface_of(scene, 192)[0])
+    surface = MeasuredSurface.of(scene)
     truth = {
         "square on the box": 0.16,
         "square on the plate": 0.09,

@@ -33,7 +33,7 @@ SMALLER = {
     "unmix-train unmix-nerf --data": shlex.join(SMALL_METHOD),
     "unmix-train unmix-nerf --load-run": "--max-num-iterations 50",
     "unmix-render --cameras orbit": "--frames 2 --size 16x16",
-    "unmix-export mesh": "--resolution 24 --density 0.05 --unseen keep",
+    "unmix-export mesh": "--resolution 24 --unseen keep",
     "unmix-demo ": "--seconds 1",
     "unmix-demo-scene --raw": "--size 32 --bands 12 --views 8",
     "unmix-demo-scene my": "--size 16 --bands 4 --views 4",
@@ -64,8 +64,8 @@ def place(tmp_path_factory):
 @pytest.mark.usefixtures("no_wait_for_the_disk", "coarse_surfaces")
 def test_every_command_runs(place, monkeypatch):
     monkeypatch.chdir(place)
-    found = page_module.find_surface
-    monkeypatch.setattr(page_module, "find_surface", lambda job, _cells: found(job, 24))
+    found = page_module.surface_of
+    monkeypatch.setattr(page_module, "surface_of", lambda scene, _cells, **shown: found(scene, 24, **shown))
     ran = set()
     for line in commands():
         for long, short in SHORTER.items():

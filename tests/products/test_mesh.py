@@ -5,156 +5,30 @@ from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
-import torch
-import trimesh
 from PIL import Image
 from plyfile import PlyData
 
-from tests.factories.ball_model import (
-    ALL_ROUND,
-    DENSITY,
-    EDGE,
-    FROM_ABOVE,
-    INNER_RADIUS,
-    RADIUS,
-    ball_scene,
-    seen_surface,
-)
+from tests.factories.ball_model import ALL_ROUND, RADIUS, ball_scene, cameras_around
 from tests.factories.cameras import FRAME
 from tests.factories.outputs import loaded_mesh
 from tests.factories.systems import needs_xatlas
-from unmix_plugin.errors import ConfigError, RunError
+from unmix_plugin.errors import ConfigError
 from unmix_plugin.products.mesh import _mesh_paths, _textures, _write_mesh, export
 from unmix_plugin.products.product import Job
 from unmix_plugin.products.scene_products import Mesh
 from unmix_plugin.trained.measures import Scale
-from unmix_plugin.trained.run_views import world_up
-from unmix_plugin.trained.surface import GridPoints, property_names, sample_field
-from unmix_plugin.trained.surface_mesh import (
-    TriangleMesh,
-    _extract_mesh,
-    _filled,
-    _surface_density,
-    _trim_unseen,
-    _without_stray_pieces,
-    surface_of,
-)
+from unmix_plugin.trained.run_views import RunView, world_up
+from unmix_plugin.trained.surface import property_names
+from unmix_plugin.trained.surface_mesh import TriangleMesh, surface_of
 
 SCENE = ball_scene()
 ABUNDANCES = property_names(SCENE.materials.names)
-PIXEL = SCENE.pixel_size
-THRESHOLD = -float(np.log(0.5)) / PIXEL
-GRID = GridPoints.over(SCENE.scene_box.aabb, 48)
 
 
 @pytest.fixture(scope="module")
-def densities():
-    return np.stack([sample_field(SCENE, GRID.slice_points(i))[0].numpy() for i in range(GRID.shape[0])])
-
-
-@pytest.fixture(scope="module")
-def whole(densities):
-    """Both sides of the hollow ball."""
-    return _extract_mesh(densities, GRID, THRESHOLD, 0.0, PIXEL)
-
-
-@pytest.fixture(scope="module")
-def seen_all_round():
-    return seen_surface(SCENE, ALL_ROUND, 20_000)
-
-
-@pytest.fixture(scope="module")
-def outside(whole, seen_all_round):
-    return _without_stray_pieces(_trim_unseen(whole, seen_all_round))
-
-
-def radii(mesh):
-    return np.linalg.norm(mesh.vertices, axis=1)
-
-
-def test_marching_finds_the_surfaces_where_they_are(whole):
-    depth = EDGE * np.log(DENSITY / THRESHOLD - 1)  # of the threshold, before the spheres
-    outer, inner = RADIUS + depth, INNER_RADIUS - depth
-    off = np.minimum(np.abs(radii(whole) - outer), np.abs(radii(whole) - inner))
-    assert off.max() < 0.6 * GRID.cell
-    volume = trimesh.Trimesh(whole.vertices, whole.faces, process=False).volume
-    assert volume == pytest.approx(4 / 3 * np.pi * (outer**3 - inner**3), rel=0.02)
-
-
-def test_insides_that_no_camera_sees_are_trimmed_and_the_rest_stays_whole_and_faces_outwards(outside):
-    outwards = outside.vertices / radii(outside)[:, None]
-    np.testing.assert_allclose(np.linalg.norm(outside.normals, axis=1), 1, atol=1e-9)
-    assert (outside.normals * outwards).sum(axis=1).min() > 0.5
-    assert radii(outside).min() > RADIUS - 0.05
-    shape = trimesh.Trimesh(outside.vertices, outside.faces, process=False)
-    assert shape.area == pytest.approx(4 * np.pi * RADIUS**2, rel=0.12)
-    assert shape.is_watertight
-
-
-def test_what_no_camera_sees_into_is_solid(densities, seen_all_round):
-    points = np.stack([GRID.slice_points(index).numpy() for index in range(GRID.shape[0])])
-    rendered = np.where(np.linalg.norm(points, axis=-1) < INNER_RADIUS + 0.1, 0, densities)
-    rendered[rendered < 1e-3 * THRESHOLD] = 0
-    shell = _extract_mesh(rendered, GRID, THRESHOLD, 0.0, PIXEL)
-    solid = _extract_mesh(_filled(rendered, GRID, SCENE, seen_all_round), GRID, THRESHOLD, 0.0, PIXEL)
-    assert radii(shell).min() < INNER_RADIUS + 0.15
-    assert radii(solid).min() > RADIUS - 0.05
-    seen_from_outside = _trim_unseen(solid, seen_all_round)
-    assert len(seen_from_outside.vertices) == int((radii(shell) > RADIUS - 0.05).sum())
-    assert radii(seen_from_outside).max() < RADIUS + 0.05
-
-
-def test_undersides_that_no_camera_sees_are_trimmed(whole):
-    trimmed = _trim_unseen(whole, seen_surface(SCENE, FROM_ABOVE, 20_000))
-    assert trimmed.vertices[:, 2].max() > 0.55
-    assert trimmed.vertices[:, 2].min() > -0.5
-    assert radii(trimmed).min() > RADIUS - 0.05
-
-
-def ribbon(count, left):
-    """Vertices and faces of `count` triangles in a row, each sharing an edge with the next."""
-    index = np.arange(count)
-    places = np.arange(count + 2)
-    vertices = np.stack([left + 0.5 * places, places % 2, np.zeros(count + 2)], axis=1)
-    return vertices, np.stack([index, index + 1, index + 2], axis=1)
-
-
-def test_stray_pieces_go_though_they_touch_the_rest_in_a_point_and_large_ones_stay():
-    (large, large_faces), (middle, middle_faces) = ribbon(120, 0.0), ribbon(20, 200.0)
-    two, two_faces = ribbon(2, 61.0)
-    vertices = np.concatenate([large, middle, two])
-    two_faces = two_faces + len(large) + len(middle)
-    two_faces[0, 0] = len(large) - 1  # the last vertex of the large piece
-    faces = np.concatenate([large_faces, middle_faces + len(large), two_faces])
-    kept = _without_stray_pieces(TriangleMesh(vertices, faces))
-    assert len(kept.faces) == 120 + 20
-    assert len(kept.vertices) == len(large) + len(middle)
-    assert len(_without_stray_pieces(TriangleMesh(*ribbon(2, 0.0))).faces) == 2
-    empty = TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
-    assert len(_without_stray_pieces(empty).faces) == 0
-
-
-def test_a_blur_does_not_move_a_flat_wall_and_a_surface_that_reaches_the_box_is_closed_there():
-    grid = GridPoints(np.zeros(3, dtype=np.float32), 0.1, (12, 12, 12))
-    wall = np.zeros(grid.shape, dtype=np.float32)
-    wall[6:] = 1e4
-    mesh = _extract_mesh(wall, grid, -np.log(0.5) / PIXEL, 1.5, PIXEL)
-    middle = mesh.vertices[(np.abs(mesh.vertices[:, 1:] - 0.55) < 0.15).all(axis=1)]
-    front = middle[middle[:, 0] < 0.9]
-    np.testing.assert_allclose(front[:, 0], 0.55, atol=0.01)
-    mesh = _extract_mesh(np.full(grid.shape, 1e4, dtype=np.float32), grid, 1.0, 0.0, PIXEL)
-    assert trimesh.Trimesh(mesh.vertices, mesh.faces).is_watertight
-    np.testing.assert_allclose(mesh.vertices.max(axis=0), 1.1, atol=0.1)
-
-
-def test_the_surface_lies_at_the_density_where_rays_end(seen_all_round):
-    points = seen_all_round.points()
-    threshold = _surface_density(SCENE, points)
-    found, _ = SCENE.field.get_density(points.positions)
-    assert (found < threshold).float().mean() == pytest.approx(0.07, abs=0.01)
-    nowhere = points.select(torch.zeros(len(points), dtype=torch.bool))
-    with pytest.raises(RunError, match="no ray of the run's cameras ends"):
-        _surface_density(SCENE, nowhere)
+def outside():
+    views = tuple(RunView(str(index), camera) for index, camera in enumerate(cameras_around(ALL_ROUND)))
+    return surface_of(replace(SCENE, views=views), 48)[0]
 
 
 @pytest.fixture(scope="module")
@@ -290,10 +164,8 @@ def test_what_shows_nothing_from_above_has_no_material(tmp_path):
 @pytest.mark.parametrize(
     ("asked", "said"),
     [
-        (Mesh(density=0.0), "--density is 0"),
-        (Mesh(density=float("nan")), "--density is nan"),
         (Mesh(smoothing=-0.5), "--smoothing is -0.5"),
-        (Mesh(smoothing=9.0), "choose 0 to 8 cells"),
+        (Mesh(smoothing=9.0), "choose 0 to 8 pixels"),
     ],
 )
 def test_impossible_settings_are_refused(asked, said):
@@ -302,11 +174,7 @@ def test_impossible_settings_are_refused(asked, said):
 
 
 @needs_xatlas
-def test_surfaces_that_are_none_and_textures_that_are_too_small_or_of_no_size_are_refused(densities, outside):
+def test_textures_that_are_too_small_or_of_no_size_are_refused(outside):
     for size, said in ((9, "--texture-size is 9; choose 16 to 8192"), (16, "choose a larger --texture-size")):
         with pytest.raises(ConfigError, match=said):
             _textures(SCENE, outside, size)
-    with pytest.raises(ConfigError, match=r"the density asked for; choose a lower --density"):
-        _extract_mesh(densities, GRID, 1e9, 0.0, PIXEL)
-    with pytest.raises(RunError, match="no camera of the run sees it; keep it with --unseen keep"):
-        surface_of(replace(SCENE, views=()), 16, THRESHOLD)

@@ -66,8 +66,10 @@ def test_a_surface_of_too_many_triangles_is_made_coarser_and_that_is_said(export
 
 def test_a_page_keeps_both_limits_and_each_surface_is_made_once(exported, tmp_path, monkeypatch):
     tried: list[int] = []
-    found = page.find_surface
-    monkeypatch.setattr(page, "find_surface", lambda job, cells: tried.append(cells) or found(job, cells))
+    found = page.surface_of
+    monkeypatch.setattr(
+        page, "surface_of", lambda scene, cells, **shown: tried.append(cells) or found(scene, cells, **shown)
+    )
     most = round(1.15 * exported[0]["arrays"]["faces"]["count"] / 3)
     arrays = exported[2].read_text().split('id="data-arrays">')[1].split("<")[0]
     monkeypatch.setattr(page, "MOST_TRIANGLES", most)

@@ -6,7 +6,6 @@ Notation: `V` vertices, `F` faces.
 from __future__ import annotations
 
 import importlib.util
-import math
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -49,18 +48,19 @@ _MOST_SMOOTHING = 8.0
 
 
 def export(job: Job, asked: Mesh) -> list[Path]:
-    """Sample the density, march through it, trim and colour the surface."""
-    density, smoothing, formats = asked.density, asked.smoothing, asked.formats
-    if density is not None and not 0 < density < math.inf:
-        raise ConfigError(f"--density is {density:g}; it must be greater than 0")
-    if not 0 <= smoothing <= _MOST_SMOOTHING:
-        raise ConfigError(f"--smoothing is {smoothing:g}; choose 0 to {_MOST_SMOOTHING:g} cells")
+    """Find the surface, colour it, and write it."""
+    formats = asked.formats
+    if not 0 <= asked.smoothing <= _MOST_SMOOTHING:
+        raise ConfigError(f"--smoothing is {asked.smoothing:g}; choose 0 to {_MOST_SMOOTHING:g} pixels")
     has_textures = asked.texture_size != 0 and bool({"glb", "obj"} & set(formats))
     if asked.texture_size is None and importlib.util.find_spec("xatlas") is None:
         has_textures = False
         job.say("no textures, since xatlas is not installed: GLB and OBJ have colours of vertices")
     job.claim(_mesh_paths(job.folder, formats, job.materials.names if has_textures else None))
-    mesh, threshold = find_surface(job, asked.resolution, density, smoothing, asked.unseen == "keep")
+    keeps_unseen = asked.unseen == "keep"
+    mesh, unseen = surface_of(
+        job.scene, asked.resolution, asked.smoothing, keeps_unseen, follow=job.follow, working=job.working
+    )
     textures = None
     if has_textures:
         with job.working("making textures"):
@@ -68,9 +68,9 @@ def export(job: Job, asked: Mesh) -> list[Path]:
         job.say(f"textures of {textures.size} x {textures.size} texels")
     with job.working("making the mesh"):
         written = _write_mesh(job.folder, formats, mesh, job.scene, job.frame, asked.up, textures)
-    density = threshold * job.frame.scale
+    fate = "is a guess that closes it" if keeps_unseen else "was cut away"
     found = f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles"
-    job.say(f"{found}, at a density of {density:.4g} per world unit")
+    job.say(f"{found}; {unseen:.0%} of the closed surface no camera sees, which {fate}")
     if "glb" in formats:
         say_units(job, "mesh.glb")
     return written
@@ -81,19 +81,6 @@ def say_units(job: Job, file: str) -> None:
     scale = job.loaded.scale
     unknown = "in units of the scene, of unknown size, where glTF has metres: unmix-export scale sets one"
     job.say(f"lengths in {file} are {unknown if scale is None else f'in metres: {scale.in_words}'}")
-
-
-def find_surface(
-    job: Job,
-    resolution: int,
-    density: float | None = None,
-    smoothing: float = 1.0,
-    keeps_unseen: bool = False,
-) -> tuple[TriangleMesh, float]:
-    """The surface of a run as `surface_of` finds it, while it is shown how far that is."""
-    return surface_of(
-        job.scene, resolution, density, smoothing, keeps_unseen, follow=job.follow, working=job.working
-    )
 
 
 def _mesh_paths(folder: Path, formats: Sequence[str], textured: Sequence[str] | None) -> list[Path]:

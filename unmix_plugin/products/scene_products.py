@@ -56,13 +56,10 @@ class Mesh(Product):
 
     formats: tuple[Literal["ply", "glb", "obj"], ...] = ("ply", "glb")
     """ply, glb, obj (with mesh.mtl)."""
-    resolution: int = 192
-    """Cells along the longest edge of the scene box."""
-    density: float | None = None
-    """Density per world unit at which the surface lies; None: that at which rays end. Lower ones close holes, higher
-    ones drop floaters."""
-    smoothing: float = 1.0
-    """Blur before the surface is looked for: standard deviation in cells, 0 for none."""
+    resolution: int | None = None
+    """Cells along the longest edge of the scene box; None: two for each pixel, from 32 to 256."""
+    smoothing: float = 0.75
+    """Blur of the distances to what cameras see: standard deviation in pixels, 0 for none."""
     unseen: Literal["drop", "keep"] = "drop"
     """What to do with surfaces that no camera of the run sees, and that were therefore never learnt."""
     up: Literal["y", "z"] = "y"

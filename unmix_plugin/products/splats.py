@@ -17,12 +17,12 @@ from jaxtyping import Float
 from trimesh import triangles
 
 from unmix_plugin.formats.meshes import Gaussians, least_turns, write_splats_glb, write_splats_ply
-from unmix_plugin.products.mesh import find_surface, gltf_content, say_units
+from unmix_plugin.products.mesh import gltf_content, say_units
 from unmix_plugin.products.product import Job
 from unmix_plugin.products.scene_products import Splats
 from unmix_plugin.trained.run_views import directions_to_world, positions_for_files, world_up
 from unmix_plugin.trained.surface import SurfaceAppearance, look_at
-from unmix_plugin.trained.surface_mesh import TriangleMesh, vertex_areas
+from unmix_plugin.trained.surface_mesh import TriangleMesh, surface_of, vertex_areas
 
 _WIDTH = 0.75
 """Standard deviation along the surface, relative to the square root of the vertex's area."""
@@ -35,8 +35,8 @@ def export(job: Job, asked: Splats) -> list[Path]:
     """Find the surface and make a Gaussian of each of its vertices."""
     paths = {kind: job.folder / f"splats.{kind}" for kind in asked.formats}
     job.claim(list(paths.values()))
-    mesh, _ = find_surface(job, asked.resolution)
     scene, frame = job.scene, job.frame
+    mesh, _ = surface_of(scene, asked.resolution, follow=job.follow, working=job.working)
     with job.working("looking at the surface's points"):
         normals = mesh.normals
         seen = look_at(

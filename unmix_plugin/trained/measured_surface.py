@@ -29,8 +29,6 @@ from unmix_plugin.trained.surface import Follow, SeenSurface, SurfaceAppearance,
 from unmix_plugin.trained.surface_mesh import TriangleMesh, Working, surface_of
 from unmix_plugin.trained.trained_scene import TrainedScene
 
-_CELLS_PER_PIXEL, _RESOLUTIONS = 2, (48, 256)
-"""Along the longest edge of the scene box, and the least and most cells there."""
 _MOST_RAYS = 1 << 20
 """By which it is found what of a region a camera sees."""
 _PARTS = ((2, 2, 2), (4, 1, 1), (1, 4, 1), (1, 1, 4))
@@ -87,10 +85,8 @@ class MeasuredSurface:
         follow: Follow = lambda _doing, items: items,
         working: Working = lambda _doing: nullcontext(),
     ) -> MeasuredSurface:
-        """The surface that `mesh` exports, with cells half as large as a pixel, as `surface_of` finds it."""
-        cells = _CELLS_PER_PIXEL * float(scene.scene_box.size.max()) / scene.pixel_size
-        resolution = round(min(max(cells, _RESOLUTIONS[0]), _RESOLUTIONS[1]))
-        mesh, _ = surface_of(scene, resolution, follow=follow, working=working)
+        """The surface that `mesh` exports, as `surface_of` finds it."""
+        mesh, _ = surface_of(scene, follow=follow, working=working)
         with working("looking at the surface's points"):
             return cls(scene, mesh)
 

@@ -130,20 +130,6 @@ class SeenSurface:
         confirmed, seen_through = self._votes(positions, tolerance)
         return (confirmed >= 1) & (seen_through <= confirmed)
 
-    def hides(self, positions: Float[Tensor, "P 3"]) -> Bool[Tensor, " P"]:
-        """Which points lie behind what the cameras see, for every camera that has them in its image."""
-        hidden = torch.zeros(len(positions), dtype=torch.bool)
-        left = torch.arange(len(positions))
-        for camera, distances in self._views:
-            inside, excess = _excess_px(camera, distances, positions[left])
-            hidden[left[inside]] |= excess < -_TOLERANCE_PX
-            # What one camera sees, or sees through, isn't asked for again: most points are in the air.
-            in_sight = torch.zeros(len(left), dtype=torch.bool)
-            in_sight[inside] = excess >= -_TOLERANCE_PX
-            hidden[left[in_sight]] = False
-            left = left[~in_sight]
-        return hidden
-
     def signed_distance(self, positions: Float[Tensor, "P 3"], reach_px: float) -> Float[Tensor, " P"]:
         """How far points lie before what the cameras see, means over those that see them or see what hides them by less
         than `reach_px` pixels of the scene's images, as parts of that, at most 1; -1 behind all that the

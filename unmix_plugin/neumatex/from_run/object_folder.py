@@ -46,9 +46,10 @@ from unmix_plugin.settings import UnmixModelConfig
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 from unmix_plugin.trained.camera_files import camera_entry
-from unmix_plugin.trained.closed_surface import closed_surface
+from unmix_plugin.trained.decimation import decimated
 from unmix_plugin.trained.open_run import LoadedRun, find_scene, load_run
 from unmix_plugin.trained.run_views import positions_for_files
+from unmix_plugin.trained.surface_mesh import surface_of
 
 _NUM_POINTS, _MOST_PIXELS, _SEED = 5000, 2_000_000, 0
 """Pixels that the light is found from, and of how many they are drawn."""
@@ -239,20 +240,23 @@ def _link(source: str | Path, target: str | Path) -> str:
 def _write_mesh(folder: Path, recipe: ObjectRecipe, loaded: LoadedRun, say: Say) -> Decision:
     """The surface of the run in the scene's world."""
     say("looking for its surface ...")
-    found, frame = closed_surface(loaded.materials_scene, recipe.num_triangles), loaded.scene.frame
-    vertices = positions_for_files(frame.to_world(found.mesh.vertices))
+    whole, unseen = surface_of(loaded.materials_scene, keeps_unseen=True)
+    mesh = decimated(whole, recipe.num_triangles)
+    vertices = positions_for_files(loaded.scene.frame.to_world(mesh.vertices))
     columns = {name: vertices[:, axis] for axis, name in enumerate("xyz")}
-    write_ply(folder / "mesh.ply", columns, found.mesh.faces, ("surface of an unmix-nerf run",))
-    unseen = f"{found.unseen:.0%} of it no camera sees, which is closed by a guess: capture the object from there, too"
-    doubt = unseen if found.unseen > _MOST_UNSEEN else "no part of it is unseen"
-    say(f"mesh of {len(found.mesh.faces):,} triangles; {doubt}")
+    write_ply(folder / "mesh.ply", columns, mesh.faces, ("surface of an unmix-nerf run",))
+    guess = (
+        f"{unseen:.0%} of it no camera sees, which is closed by a guess: capture the object from there, too"
+    )
+    doubt = guess if unseen > _MOST_UNSEEN else "no part of it is unseen"
+    say(f"mesh of {len(mesh.faces):,} triangles; {doubt}")
     return Decision(
         "mesh",
         "closed surface of the run",
         {
-            "triangles": len(found.mesh.faces),
-            "before it was decimated": found.num_found,
-            "part that no camera sees": found.unseen,
+            "triangles": len(mesh.faces),
+            "before it was decimated": len(whole.faces),
+            "part that no camera sees": unseen,
         },
         "outlines of mesh and alpha that differ, which is refused or noted when training begins",
         "--mesh",

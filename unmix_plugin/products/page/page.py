@@ -36,7 +36,6 @@ from unmix_plugin.figures.paint import colour_table
 from unmix_plugin.formats.files import eight_bits, write_file
 from unmix_plugin.formats.html import fill_template
 from unmix_plugin.formats.libraries import library_of
-from unmix_plugin.products.mesh import find_surface
 from unmix_plugin.products.product import Job
 from unmix_plugin.products.regions import measure_regions
 from unmix_plugin.products.scene_products import Page
@@ -49,7 +48,7 @@ from unmix_plugin.trained.measured_surface import MeasuredSurface
 from unmix_plugin.trained.run_materials import endmember_colours, relit
 from unmix_plugin.trained.run_views import directions_to_world, world_up
 from unmix_plugin.trained.surface import look_at
-from unmix_plugin.trained.surface_mesh import TriangleMesh, vertex_areas
+from unmix_plugin.trained.surface_mesh import TriangleMesh, surface_of, vertex_areas
 from unmix_plugin.trained.trained_scene import TrainedScene
 
 MOST_BYTES = 20_000_000
@@ -216,14 +215,14 @@ def _coarser(resolution: int, part: float) -> int:
 
 def _mixture_content(job: Job, resolution: int) -> tuple[PageContent, int]:
     """Of a scene of mixed materials, and the resolution that `MOST_TRIANGLES` leave."""
-    mesh, notes = find_surface(job, resolution)[0], []
+    mesh, notes = surface_of(job.scene, resolution, follow=job.follow, working=job.working)[0], []
     while len(mesh.faces) > MOST_TRIANGLES:
         resolution = _coarser(resolution, MOST_TRIANGLES / len(mesh.faces))
         job.say(
             f"the surface of {len(mesh.faces):,} triangles is made again with {resolution} cells along the longest "
             f"edge: browsers turn {MOST_TRIANGLES:,} smoothly"
         )
-        mesh = find_surface(job, resolution)[0]
+        mesh, _ = surface_of(job.scene, resolution, follow=job.follow, working=job.working)
     with job.working("looking at the surface's points"):
         arrays = _vertex_arrays(job.scene, mesh, job.frame)
     arrays["areas"] = vertex_areas(mesh.areas() / job.frame.scale**2, mesh.faces, len(mesh.vertices))

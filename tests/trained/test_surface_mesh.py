@@ -1,0 +1,99 @@
+"""The surface of a scene: where its cameras see it, closed or cut to what they see."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from tests.factories.ball_model import FROM_ABOVE, INNER_RADIUS, RADIUS, ball_scene, cameras_around
+from tests.factories.cameras import around
+from unmix_plugin.errors import ConfigError, RunError
+from unmix_plugin.trained.run_views import RunView
+from unmix_plugin.trained.surface import SeenSurface
+from unmix_plugin.trained.surface_mesh import TriangleMesh, surface_of, without_stray_pieces
+
+ALL = around(14)
+SCENE = replace(ball_scene(), views=tuple(RunView(str(index), ALL[index]) for index in range(len(ALL))))
+ABOVE = tuple(RunView(str(index), camera) for index, camera in enumerate(cameras_around(FROM_ABOVE)))
+
+
+def test_a_hollow_ball_is_one_closed_surface_where_the_ball_ends():
+    found, unseen = surface_of(SCENE, keeps_unseen=True)
+    mesh = trimesh.Trimesh(found.vertices, found.faces, process=False)
+    assert mesh.is_watertight
+    assert mesh.body_count == 1
+    radius = np.linalg.norm(mesh.vertices, axis=1)
+    assert radius.min() > INNER_RADIUS
+    assert abs(radius.mean() - RADIUS) < SCENE.pixel_size / 2
+    assert mesh.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.05)
+    assert 0 <= unseen < 1
+
+
+def test_normals_are_of_length_1_and_face_outwards():
+    mesh, _ = surface_of(SCENE)
+    outwards = mesh.vertices / np.linalg.norm(mesh.vertices, axis=1, keepdims=True)
+    np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1, atol=1e-9)
+    assert (mesh.normals * outwards).sum(axis=1).min() > 0.5
+
+
+def test_a_side_that_no_camera_sees_is_closed_and_counted_or_cut_away():
+    scene = replace(SCENE, views=ABOVE)
+    whole, unseen = surface_of(scene, keeps_unseen=True)
+    assert trimesh.Trimesh(whole.vertices, whole.faces, process=False).is_watertight
+    assert unseen > 0.2
+    shown, same = surface_of(scene)
+    assert same == unseen
+    assert shown.vertices[:, 2].max() > 0.55
+    assert shown.vertices[:, 2].min() > -0.5
+    assert shown.areas().sum() == pytest.approx((1 - unseen) * whole.areas().sum(), rel=0.05)
+
+
+def test_distances_are_those_to_what_is_seen_in_pixels():
+    seen = SeenSurface(SCENE, 20_000, [view.camera for view in SCENE.views])
+    reach = 2.0
+    outside, at, inside = ((RADIUS + step) for step in (0.35, 0.0, -0.4))
+    points = torch.tensor([[outside, 0.0, 0.0], [at, 0.0, 0.0], [inside, 0.0, 0.0]])
+    far, near, within = seen.signed_distance(points, reach).tolist()
+    assert far > 0.9
+    assert abs(near) < 0.5
+    assert within == -1
+    assert float(seen.signed_distance(torch.full((1, 3), 50.0), reach)) == 1  # in no image
+
+
+def test_a_coarse_grid_finds_the_same_surface_as_a_fine_one():
+    for cells in (16, 96):
+        mesh, _ = surface_of(SCENE, cells, keeps_unseen=True)
+        cell = float(SCENE.scene_box.size.max()) / cells
+        radii = np.linalg.norm(mesh.vertices, axis=1)
+        assert abs(radii.mean() - RADIUS) < max(SCENE.pixel_size, 0.5 * cell) / 2
+
+
+def ribbon(count, left):
+    """Vertices and faces of `count` triangles in a row, each sharing an edge with the next."""
+    index = np.arange(count)
+    places = np.arange(count + 2)
+    vertices = np.stack([left + 0.5 * places, places % 2, np.zeros(count + 2)], axis=1)
+    return vertices, np.stack([index, index + 1, index + 2], axis=1)
+
+
+def test_stray_pieces_go_and_large_ones_stay():
+    (large, large_faces), (middle, middle_faces) = ribbon(1200, 0.0), ribbon(20, 2000.0)
+    two, two_faces = ribbon(2, 610.0)
+    vertices = np.concatenate([large, middle, two])
+    faces = np.concatenate([large_faces, middle_faces + len(large), two_faces + len(large) + len(middle)])
+    kept = without_stray_pieces(TriangleMesh(vertices, faces))
+    assert len(kept.faces) == 1200 + 20
+    assert len(kept.vertices) == len(large) + len(middle)
+    assert len(without_stray_pieces(TriangleMesh(*ribbon(2, 0.0))).faces) == 2
+    empty = TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
+    assert len(without_stray_pieces(empty).faces) == 0
+
+
+def test_nothing_seen_is_refused(monkeypatch):
+    monkeypatch.setattr(SeenSurface, "signed_distance", lambda _, points, __: torch.ones(len(points)))
+    with pytest.raises(RunError, match="train longer"):
+        surface_of(SCENE)
+    with pytest.raises(ConfigError, match="--resolution is 4; choose 8 to 1024"):
+        surface_of(SCENE, 4)
