@@ -24,6 +24,7 @@ from unmix_plugin.trained.places import MeasuredScene, NamedRegion, spectrum_at
 from unmix_plugin.trained.regions import Box, OfMaterial
 from unmix_plugin.trained.run_views import RunView
 from unmix_plugin.trained.surface_mesh import TriangleMesh
+from unmix_plugin.trained.training_views import thinned_views
 
 PIXEL = 0.01
 WORLD_RADIUS = RADIUS / FRAME.scale
@@ -142,7 +143,7 @@ def measured(tmp_path_factory):
     split = {**dict.fromkeys(scene.train_indices, "train"), **dict.fromkeys(scene.eval_indices, "eval")}
     views = tuple(RunView(scene.frames[i].name, scene.cameras[i], which) for i, which in split.items())  # type: ignore[arg-type]
     ball = replace(ball_scene(), views=views, frame=FRAME)
-    errors = measure_errors(ball, MeasuredScene(scene, None))
+    errors = measure_errors(ball, list(thinned_views(ball, MeasuredScene(scene, None))))
     assert errors is not None
     return replace(ball, measured_errors=errors)
 

@@ -43,7 +43,18 @@ def floor_views(retouch: np.ndarray | None = None, count: int = 5, noise: float 
         spectra += noise * generator.standard_normal(spectra.shape)
         full = np.ones((SIZE, SIZE))
         views.append(
-            ThinnedView(f"view_{number}", spectra, spectra, full > 0, full < 0, full, points, EDGE * full)
+            ThinnedView(
+                name=f"view_{number}",
+                measured=spectra,
+                rendered=spectra,
+                counts=full > 0,
+                is_whole=full > 0,
+                blown_out=full < 0,
+                opacity=full,
+                abundances=fractions,
+                points=points,
+                pixel=EDGE * full,
+            )
         )
     return views
 

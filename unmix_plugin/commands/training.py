@@ -213,7 +213,8 @@ def _judge_training_views(trainer: Trainer, scene: Scene, console: Console, step
         trained = mixture_scene(trainer.pipeline.model, trainer.config.method_name, record, averages)
         if trained is None:
             return
-        views = list(thinned_views(trained, scene))
+        measured = MeasuredScene(scene, record.summary.get("illuminant"))
+        views = list(thinned_views(trained, measured))
         fits = [fit for fit in map(fit_of_view, views) if fit is not None]
         misfits = write_fits(run.path, fits)
         unexplained = find_unexplained(trained, [view for view in views if view.name not in misfits])
@@ -221,8 +222,7 @@ def _judge_training_views(trainer: Trainer, scene: Scene, console: Console, step
         if unexplained is not None:
             write_unexplained(run.path, unexplained, trained.materials)
             remarks += unexplained.in_words(run.path)
-        measured = MeasuredScene(scene, record.summary.get("illuminant"))
-        write_errors(run.path, measure_errors(trained, measured), steps)
+        write_errors(run.path, measure_errors(trained, views), steps)
     for remark in remarks:
         say(console, f"warning: {remark}")
         write_event(run, remark)

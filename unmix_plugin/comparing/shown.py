@@ -78,7 +78,7 @@ def show_view(comparison: Comparison, view: RunView) -> ShownView:
     later = second.look(carried_camera(comparison, camera))
     rays = camera.image_rays(0)
     distance = seen.coefficients.ray_distance.flatten().cpu()
-    ends = first.frame.to_world((rays.origins + distance[:, None] * rays.directions).double().numpy())
+    ends = first.frame.to_world(rays.at(distance).double().numpy())
     away, nearest = KDTree(comparison.surface.positions).query(ends)
     there = seen.coefficients.accumulation.flatten().cpu().numpy() >= OCCUPIED_ACCUMULATION
     there &= away <= _SAME_PLACE_PX * comparison.before.pixel

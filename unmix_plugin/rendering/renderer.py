@@ -226,7 +226,7 @@ class VolumeRenderer:
         for i in range(0, len(ray_bundle), chunk):
             rays, distance = ray_bundle[i : i + chunk], ray_distance[i : i + chunk]
             with torch.enable_grad():
-                positions = (rays.origins + distance[:, None] * rays.directions).detach().requires_grad_()
+                positions = rays.at(distance).detach().requires_grad_()
                 log_density = field.get_density(positions)[0].clamp(min=1e-20).log().sum()
                 (gradient,) = torch.autograd.grad(log_density, positions)
             parts.append(torch.nn.functional.normalize(-gradient, dim=-1))

@@ -1,31 +1,26 @@
 """What training views measured beside what a scene renders, pixel by pixel: where expected errors come from, and the
 file of a run that keeps them.
-
-Notation: `B` bands, `K` endmembers.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
 import safetensors.torch
 import torch
-from jaxtyping import Float
 from safetensors import SafetensorError, safe_open
-from torch import Tensor
 
 from unmix_plugin.engine.runs.atomic_files import whole_file, write_errors_as
 from unmix_plugin.engine.runs.replacing import remove
 from unmix_plugin.errors import RunError
 from unmix_plugin.losses.abundance_guide import mixing_penalty
-from unmix_plugin.rendering.front_to_back import composite
-from unmix_plugin.spectral.evidence import OPAQUE_ALPHA
+from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION
 from unmix_plugin.spectral.unmixing.abundances import nnls, sparse_abundances
 from unmix_plugin.spectral.unmixing.endmembers import has_spectral_shape
 from unmix_plugin.trained.place_errors import PixelErrors, PlaceErrors
-from unmix_plugin.trained.places import MeasuredScene
 from unmix_plugin.trained.trained_scene import TrainedScene
+from unmix_plugin.trained.training_views import ThinnedView
 
 FILE_NAME = "errors.safetensors"
 """In the folder of a run."""
@@ -38,70 +33,37 @@ _MOST_BYTES = 1 << 30
 
 
 @torch.no_grad()
-def measure_errors(trained: TrainedScene, measured: MeasuredScene) -> PlaceErrors | None:
+def measure_errors(trained: TrainedScene, views: Sequence[ThinnedView]) -> PlaceErrors | None:
     """How far a scene as it was trained is from what its training views with all bands measured; None where these are
-    fewer than three or show too little. Reads their cubes."""
-    scene, views, parts = measured.scene, [], []
-    indices = measured.usable_views
-    for number, index in enumerate(indices):
-        camera = measured.camera(index, trained)
-        stride = max(1, round((camera.width * camera.height * len(indices) / _PIXELS) ** 0.5))
-        rows, columns = (slice((turn * number) % stride, None, stride) for turn in (1, 3))
-        values = measured.comparable(index, scene.cube(index, (rows, columns)), trained)
-        counts, alpha = scene.valid_mask(index, (rows, columns)), scene.alpha(index)
-        if alpha is not None:
-            counts = counts & (alpha[rows, columns] > OPAQUE_ALPHA)
-        grid = np.stack(
-            np.meshgrid(np.arange(camera.width)[columns], np.arange(camera.height)[rows]), axis=-1
+    fewer than three or show too little. Abundances are compared with those of the measured spectra as mixtures of few
+    endmembers, and as mixtures of any number: where spectra do not tell mixtures apart, the two differ."""
+    step = max(1, round(sum(view.opacity.size for view in views) / _PIXELS))
+    parts = []
+    for number, view in enumerate(views):
+        spectra = torch.from_numpy(view.measured).float()
+        kept = torch.from_numpy(view.is_whole & (view.opacity >= OCCUPIED_ACCUMULATION)) & has_spectral_shape(
+            spectra
         )
-        coords = torch.from_numpy(grid[counts] + 0.5).float()
-        if len(coords) == 0:
-            continue
-        rays = camera.generate_rays(torch.zeros(len(coords), dtype=torch.int64), coords)
-        seen = composite(trained.renderer, trained.field, rays.to(trained.device))
-        spectra, kept = torch.from_numpy(values[counts]).to(trained.device).float(), seen.is_occupied
-        kept = kept & has_spectral_shape(spectra)
-        places = rays.origins.to(trained.device) + seen.ray_distance[:, None] * rays.directions.to(
-            trained.device
-        )
-        opaque = seen.accumulation.clamp(min=1e-6)[:, None]
-        abundances, rendered = seen.abundances / opaque, trained.materials.spectra(seen) / opaque
-        of_view = torch.full((len(coords),), number, device=trained.device)
-        found = (places, of_view, rendered, abundances, spectra)
-        parts.append([one[kept].cpu() for one in found])
-        views += [number] if bool(kept.any()) else []
-    if len(views) < 3 or sum(len(part[0]) for part in parts) < _LEAST_PIXELS:
+        rows = kept.flatten().nonzero()[number % step :: step, 0]
+        if len(rows):
+            shown = (view.opacity[..., None], view.points, view.rendered, view.abundances, view.measured)
+            columns = [torch.from_numpy(one).flatten(0, 1)[rows].float() for one in shown]
+            parts.append([torch.full((len(rows),), number), *columns])
+    if len(parts) < 3 or sum(len(part[0]) for part in parts) < _LEAST_PIXELS:
         return None
-    places, of_view, rendered, abundances, spectra = map(torch.cat, zip(*parts, strict=True))
-    return PlaceErrors.fit(
-        _compared(trained, places, of_view, rendered, abundances, spectra),
-        trained.scene_box.aabb[0].cpu(),
-        trained.pixel_size,
-    )
-
-
-def _compared(
-    trained: TrainedScene,
-    places: Float[Tensor, "N 3"],
-    views: Tensor,
-    rendered: Float[Tensor, "N B"],
-    abundances: Float[Tensor, "N K"],
-    measured: Float[Tensor, "N B"],
-) -> PixelErrors:
-    """Errors of pixels: abundances against those of the measured spectra as mixtures of few endmembers, and as mixtures
-    of any number. Where spectra do not tell mixtures apart, the two differ."""
-    endmembers = trained.materials.endmembers.cpu()
+    of_view, opacity, places, rendered, abundances, measured = map(torch.cat, zip(*parts, strict=True))
+    abundances, endmembers = abundances / opacity, trained.materials.endmembers.cpu()
     amounts = nnls(measured.double(), endmembers.double())
     of_any = (amounts / amounts.sum(dim=1, keepdim=True).clamp(min=1e-12)).float()
-    of_few = sparse_abundances(measured, endmembers, mixing_penalty(measured, endmembers))
-    both = (of_few, of_any)
-    return PixelErrors(
+    both = (sparse_abundances(measured, endmembers, mixing_penalty(measured, endmembers)), of_any)
+    errors = PixelErrors(
         places,
-        views,
-        rendered - measured,
+        of_view,
+        rendered / opacity - measured,
         tuple(abundances - one for one in both),
         tuple(torch.maximum(abundances, one) for one in both),
     )
+    return PlaceErrors.fit(errors, trained.scene_box.aabb[0].cpu(), trained.pixel_size)
 
 
 def write_errors(run: Path, errors: PlaceErrors | None, steps: int) -> None:

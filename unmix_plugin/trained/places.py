@@ -231,8 +231,7 @@ def _ends_near(
     points: Float[Tensor, "#P 3"],
     pixels: Float[Tensor, " P"],
 ) -> Bool[Tensor, " P"]:
-    ends = rays.origins + distances[:, None] * rays.directions
-    return (ends - points).norm(
+    return (rays.at(distances) - points).norm(
         dim=-1
     ) <= _SAME_PLACE_PX * pixels  # False where a ray ends nowhere, at infinity
 

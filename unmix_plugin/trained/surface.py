@@ -110,7 +110,7 @@ class SeenSurface:
         distances[accumulation < OCCUPIED_ACCUMULATION] = torch.inf
         self._views.append((view, distances.unflatten(0, (view.height, view.width))))
         rays = view.image_rays(0)
-        positions = rays.origins + distances[:, None] * rays.directions
+        positions = rays.at(distances)
         solid = accumulation >= _SOLID_ACCUMULATION
         if self._scene.renderer.is_unbounded:  # a horizon would dwarf everything else
             solid &= self._scene.scene_box.to("cpu").contains(positions)

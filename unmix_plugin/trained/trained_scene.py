@@ -114,8 +114,11 @@ class MaterialView(MixtureView):
         scene, seen = self.scene, self.coefficients
         assert scene.unexplained is not None, "of such a scene the output is refused"
         rays = self.camera.to(seen.packed.device).image_rays(0)
-        ends = rays.origins + seen.ray_distance.reshape(-1, 1) * rays.directions
-        return scene.unexplained.at(ends).view_as(self.opacity).where(seen.is_occupied, torch.nan)
+        return (
+            scene.unexplained.at(rays.at(seen.ray_distance.flatten()))
+            .view_as(self.opacity)
+            .where(seen.is_occupied, torch.nan)
+        )
 
     @property
     def has_removed(self) -> bool:
@@ -127,8 +130,8 @@ class MaterialView(MixtureView):
         """What is seen in each pixel, and how far it is expected to be off; a ConfigError where that is unknown."""
         errors, seen = self.scene.require_errors(), self.coefficients
         rays = self.camera.to(errors.origin.device).image_rays(0)
-        positions = rays.origins + seen.ray_distance.flatten()[:, None].to(rays.origins) * rays.directions
-        local = errors.at(positions.view(*self.opacity.shape, 3)).to(self.opacity.device)
+        positions = rays.at(seen.ray_distance.flatten().to(rays.origins)).view(*self.opacity.shape, 3)
+        local = errors.at(positions).to(self.opacity.device)
         opaque = self.opacity.clamp(min=1e-6)[..., None]
         return SeenPlaces(self.spectra / opaque, seen.abundances / opaque, self.opacity, local)
 
@@ -302,7 +305,7 @@ class TrainedScene:
         place = None
         if opacity > 0:
             rays = one.image_rays(0)
-            place = _row(rays.origins + found.ray_distance[:, None] * rays.directions)
+            place = _row(rays.at(found.ray_distance))
         return Probe(
             {
                 "predicted": _row(diffuse + specular),
@@ -412,7 +415,7 @@ def reference_rays(scene: TrainedScene, cameras: Cameras) -> tuple[Coefficients,
         seen = scene.look(camera, subpixels=1).coefficients.flatten()
         rays = camera.to(scene.device).image_rays(0)
         parts.append(seen.map(lambda packed, is_seen=seen.is_occupied: packed[is_seen]))
-        points.append((rays.origins + seen.ray_distance[:, None] * rays.directions)[seen.is_occupied])
+        points.append(rays.at(seen.ray_distance)[seen.is_occupied])
     return Coefficients.concatenate(parts), torch.cat(points)
 
 

@@ -45,6 +45,10 @@ class RayBundle:
         """The rays at a slice, an index tensor (R',) or a boolean mask (R,)."""
         return self._map(lambda column: column[index])
 
+    def at(self, distances: Float[Tensor, " R"]) -> Float[Tensor, "R 3"]:
+        """Points of the rays so far from their origins."""
+        return self.origins + distances[:, None] * self.directions
+
     @staticmethod
     def join(bundles: Sequence[RayBundle]) -> RayBundle:
         """The rays of several bundles that know the same of their rays, one after the other."""

@@ -104,7 +104,7 @@ def _box_of_places(cameras: Cameras, points: MatchedPoints) -> SceneBox:
             rays = cameras.generate_rays(torch.full((4,), view), coords)
             assert rays.axes is not None
             away = depth / (rays.directions * rays.axes).sum(dim=-1)
-            ends.append(rays.origins + away[:, None] * rays.directions)
+            ends.append(rays.at(away))
         corners = torch.cat(ends).double().numpy()
         low, high = np.minimum(low, corners.min(axis=0)), np.maximum(high, corners.max(axis=0))
     return _box(low - margin, high + margin)

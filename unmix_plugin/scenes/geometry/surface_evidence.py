@@ -244,4 +244,4 @@ class SurfaceEvidence:
         view = swept[pixels.cameras]
         found = distances[view, rows, columns].masked_fill(view < 0, torch.inf)
         known = torch.where(torch.isfinite(found), found, torch.nan)
-        return rays.origins + known[:, None] * rays.directions
+        return rays.at(known)

@@ -192,7 +192,7 @@ class MeasuredViews:
         seen = (coefficients.accumulation > OCCUPIED_ACCUMULATION).nonzero()[:, 0]
         if len(seen):
             rays = frame.camera.to(device).image_rays(0)
-            points = (rays.origins + coefficients.ray_distance[:, None] * rays.directions)[seen]
+            points = rays.at(coefficients.ray_distance)[seen]
             pixels, sees = self._pixels_of(points.cpu(), index, self.measured.camera(index, frame.scene))
             measured = self.measured.comparable(index, scene.cube(index, pixels), frame.scene)
             spectra = frame.materials.spectra(coefficients.map(lambda packed: packed[seen[sees]])).cpu()
