@@ -40,15 +40,13 @@ def measure_errors(trained: TrainedScene, views: Sequence[ThinnedView]) -> Place
     step = max(1, round(sum(view.opacity.size for view in views) / _PIXELS))
     parts = []
     for number, view in enumerate(views):
-        spectra = torch.from_numpy(view.measured).float()
-        kept = torch.from_numpy(view.is_whole & (view.opacity >= OCCUPIED_ACCUMULATION)) & has_spectral_shape(
-            spectra
-        )
-        rows = kept.flatten().nonzero()[number % step :: step, 0]
+        shown = (view.opacity[..., None], view.points, view.rendered, view.abundances, view.measured)
+        columns = [torch.from_numpy(one).flatten(0, 1).float() for one in shown]
+        kept = view.is_whole & (view.opacity > OCCUPIED_ACCUMULATION)
+        counts = torch.from_numpy(kept).flatten() & has_spectral_shape(columns[-1])
+        rows = counts.nonzero()[number % step :: step, 0]
         if len(rows):
-            shown = (view.opacity[..., None], view.points, view.rendered, view.abundances, view.measured)
-            columns = [torch.from_numpy(one).flatten(0, 1)[rows].float() for one in shown]
-            parts.append([torch.full((len(rows),), number), *columns])
+            parts.append([torch.full((len(rows),), number), *(column[rows] for column in columns)])
     if len(parts) < 3 or sum(len(part[0]) for part in parts) < _LEAST_PIXELS:
         return None
     of_view, opacity, places, rendered, abundances, measured = map(torch.cat, zip(*parts, strict=True))

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -38,6 +39,7 @@ _DIRECTIONS = 8
 _LEAST_SQUARE = 1e-7
 """Added to mean squares: rounding of what was measured."""
 _INDEX_BITS = 20
+_HALF = 1 << (_INDEX_BITS - 1)
 _PRESENT = 0.01
 """An abundance or what it is compared with has to be as large to decide how wide intervals are: an absent material is
 found to be absent, which says nothing of those that are there."""
@@ -59,6 +61,45 @@ class PixelErrors:
 
 
 @dataclass(frozen=True)
+class CellGrid:
+    """Cubes that divide space. The key of a cell is one number; those of its neighbours differ from it by
+    `NEIGHBOURS`."""
+
+    origin: Float[Tensor, "3"]
+    """A corner of the cell (0, 0, 0)."""
+    edge: float | Tensor
+
+    def indices(self, positions: Float[Tensor, "*places 3"]) -> Int64[Tensor, "*places 3"]:
+        """Of the cells in which positions lie; far away ones share the outermost."""
+        steps = ((positions.double() - self.origin.double()) / self.edge).floor()
+        return steps.clamp(-_HALF, _HALF - 1).nan_to_num().long()
+
+    def keys(self, positions: Float[Tensor, "*places 3"]) -> Int64[Tensor, "*places"]:
+        """Of the cells in which positions lie."""
+        return self.keys_of(self.indices(positions))
+
+    @staticmethod
+    def keys_of(indices: Int64[Tensor, "*cells 3"]) -> Int64[Tensor, "*cells"]:
+        """Of cells by their indices."""
+        x, y, z = (indices + _HALF).unbind(dim=-1)
+        return (x << 2 * _INDEX_BITS) | (y << _INDEX_BITS) | z
+
+
+NEIGHBOURS = tuple(
+    (x << 2 * _INDEX_BITS) + (y << _INDEX_BITS) + z for x, y, z in product((-1, 0, 1), repeat=3)
+)
+"""From the key of a cell to those around it, itself in the middle."""
+
+
+def find_keys(
+    known: Int64[Tensor, "C"], keys: Int64[Tensor, "*places"]
+) -> tuple[Int64[Tensor, "*places"], Bool[Tensor, "*places"]]:
+    """Row of each key among increasing ones, and whether it is there."""
+    rows = torch.searchsorted(known, keys).clamp(max=len(known) - 1)
+    return rows, known[rows] == keys
+
+
+@dataclass(frozen=True)
 class Cells:
     """Sums over the cells of one size."""
 
@@ -70,11 +111,6 @@ class Cells:
     """Views that measured any of them."""
     sums: Float[Tensor, "C Q"]
     """Of squared errors."""
-
-    def find(self, keys: Int64[Tensor, "P"]) -> tuple[Int64[Tensor, "P"], Bool[Tensor, "P"]]:
-        """Row of each cell, and whether it is there."""
-        rows = torch.searchsorted(self.keys, keys).clamp(max=len(self.keys) - 1)
-        return rows, self.keys[rows] == keys
 
 
 @dataclass(frozen=True)
@@ -129,7 +165,7 @@ class PlaceErrors:
         squares = torch.cat([of_abundances, of_spectra], dim=1)
         usual = squares.mean(dim=0)
 
-        keys = [_keys(errors.positions, origin, size * pixel_size) for size in CELL_SIZES_PX]
+        keys = [CellGrid(origin, size * pixel_size).keys(errors.positions) for size in CELL_SIZES_PX]
         large, small = (_cells(own, errors.views, squares) for own in keys)
         deviations = _without_own_view(keys, errors.views, squares, usual)
         of_places, of_spectrum = deviations[:, :-1], deviations[:, -1:] * band_squares.sqrt()
@@ -139,7 +175,7 @@ class PlaceErrors:
         eigen = torch.linalg.eigh(spectra.T @ spectra / len(spectra))
         kept = slice(-min(_DIRECTIONS, spectra.shape[1]), None)
         directions = (eigen.eigenvectors[:, kept] * eigen.eigenvalues[kept].clamp(min=0).sqrt()).T
-        sizes = [_keys(errors.positions, origin, size * pixel_size) for size in _REGION_SIZES_PX]
+        sizes = [CellGrid(origin, size * pixel_size).keys(errors.positions) for size in _REGION_SIZES_PX]
         mean_error = torch.stack([one.double() for one in errors.abundances]).mean(dim=0)
         found = PlaceErrors(
             origin.double(),
@@ -162,7 +198,7 @@ class PlaceErrors:
         squares = self.usual.expand(len(flat), -1)
         is_known = torch.zeros(len(flat), dtype=torch.bool, device=flat.device)
         for size, cells in zip(CELL_SIZES_PX, (self.large, self.small), strict=True):
-            rows, is_there = cells.find(_keys(flat, self.origin, size * self.pixel_size))
+            rows, is_there = find_keys(cells.keys, CellGrid(self.origin, size * self.pixel_size).keys(flat))
             counts = torch.where(is_there, cells.counts[rows], 0.0)[:, None]
             sums = torch.where(is_there[:, None], cells.sums[rows], 0.0)
             squares = (sums + _PRIOR_PIXELS * squares) / (counts + _PRIOR_PIXELS)
@@ -229,16 +265,6 @@ class PlaceErrors:
             one.name: tensors[one.name] for one in fields(PlaceErrors) if one.name not in ("large", "small")
         }
         return PlaceErrors(large=large, small=small, **plain)
-
-
-def _keys(
-    positions: Float[Tensor, "P 3"], origin: Float[Tensor, "3"], edge: float | Tensor
-) -> Int64[Tensor, "P"]:
-    """Numbers of the cells in which positions lie; far away ones share the outermost."""
-    half = 1 << (_INDEX_BITS - 1)
-    steps = ((positions.double() - origin.double()) / edge).floor().clamp(-half, half - 1).nan_to_num().long()
-    x, y, z = (steps + half).unbind(dim=-1)
-    return (x << 2 * _INDEX_BITS) | (y << _INDEX_BITS) | z
 
 
 def _cells(keys: Int64[Tensor, "N"], views: Int64[Tensor, "N"], squares: Float[Tensor, "N Q"]) -> Cells:

@@ -24,7 +24,8 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Bool, Float64, Int64
-from scipy import ndimage
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from unmix_plugin.engine.runs.atomic_files import read_run_json, write_run_json
 from unmix_plugin.engine.sampling import robust_deviation
@@ -32,6 +33,7 @@ from unmix_plugin.errors import RunError
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.spectral.unmixing.abundances import nnls
+from unmix_plugin.trained.place_errors import NEIGHBOURS, CellGrid, find_keys
 from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.trained.training_views import ThinnedView
 from unmix_plugin.trained.unexplained_map import MOST_CELLS, UnexplainedMap, read_unexplained_map
@@ -124,9 +126,8 @@ def find_unexplained(trained: TrainedScene, views: Iterable[ThinnedView]) -> Une
     measured, places, seen_by = np.concatenate(spectra), np.concatenate(points), np.concatenate(numbers)
     origin = places.min(axis=0)
     edge = max(float(np.median(np.concatenate(sizes))), float(np.ptp(places, axis=0).max()) / MOST_CELLS)
-    cells, cell_of, counts = np.unique(
-        np.floor((places - origin) / edge).astype(np.int64), axis=0, return_inverse=True, return_counts=True
-    )
+    of_pixels = CellGrid(torch.from_numpy(origin), edge).indices(torch.from_numpy(places)).numpy()
+    cells, cell_of, counts = np.unique(of_pixels, axis=0, return_inverse=True, return_counts=True)
     cell_of = cell_of.reshape(-1)
     pairs = np.unique(np.stack([cell_of, seen_by], axis=1), axis=0)
     num_views = np.bincount(pairs[:, 0], minlength=len(cells))
@@ -187,12 +188,16 @@ def _touching(
     cells: Int64[np.ndarray, "C 3"], chosen: Bool[np.ndarray, " C"]
 ) -> list[Int64[np.ndarray, " N"]]:
     """Rows of the chosen cells, by groups that touch at faces, edges or corners."""
-    volume = np.zeros(tuple(cells.max(axis=0) + 1), dtype=bool)
-    volume[tuple(cells[chosen].T)] = True
-    labels = np.zeros(volume.shape, dtype=np.int32)
-    ndimage.label(volume, np.ones((3, 3, 3)), output=labels)
-    of_cell = np.where(chosen, labels[tuple(cells.T)], 0)
-    return [np.flatnonzero(of_cell == number) for number in range(1, int(labels.max()) + 1)]
+    picked = np.flatnonzero(chosen)
+    if not len(picked):
+        return []
+    known, order = CellGrid.keys_of(torch.from_numpy(cells[picked])).sort()
+    found = [find_keys(known, known + step) for step in NEIGHBOURS]
+    first = torch.cat([is_there.nonzero()[:, 0] for _, is_there in found]).numpy()
+    second = torch.cat([rows[is_there] for rows, is_there in found]).numpy()
+    links = coo_matrix((np.ones(len(first)), (first, second)), shape=(len(picked), len(picked)))
+    count, groups = connected_components(links, directed=False)
+    return [picked[order.numpy()[groups == number]] for number in range(count)]
 
 
 def write_unexplained(run: Path, found: Unexplained, materials: Materials) -> None:

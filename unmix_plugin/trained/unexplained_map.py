@@ -6,18 +6,17 @@ Notation: `C` cells.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from zipfile import BadZipFile
 
 import numpy as np
 import torch
 from jaxtyping import Float, Float32, Float64, Int64
-from scipy import ndimage
 from torch import Tensor
 
 from unmix_plugin.engine.runs.atomic_files import whole_file
 from unmix_plugin.errors import RunError
+from unmix_plugin.trained.place_errors import NEIGHBOURS, CellGrid, find_keys
 
 FILE_NAME = "unexplained.npz"
 """In the folder of a run."""
@@ -37,27 +36,17 @@ class UnexplainedMap:
     values: Float32[np.ndarray, " C"]
     """u, [0, 1]."""
 
-    @cached_property
-    def _smooth(self) -> Float32[np.ndarray, "X Y Z"]:
-        """The mean of each cell and the 26 around it, as far as they are known; with a margin of one cell."""
-        known = np.full(tuple(self.cells.max(axis=0) + 3), np.nan, dtype=np.float32)
-        known[tuple((self.cells + 1).T)] = self.values
-        there = np.isfinite(known).astype(np.float64)
-        total, weight = (
-            ndimage.uniform_filter(values, 3, mode="constant")
-            for values in (np.nan_to_num(known) * there, there)
-        )
-        return np.where(weight > 1e-6, total / np.maximum(weight, 1e-6), np.nan).astype(np.float32)
-
     def at(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
         """u at points of model space: the mean of their cell and the 26 around it that are known, NaN without any."""
-        smooth = self._smooth
-        place = points.detach().cpu().double().numpy()
-        index = np.floor((place - self.origin) / self.edge).astype(np.int64) + 1
-        inside = ((index >= 0) & (index < smooth.shape)).all(axis=-1)
-        index = np.where(np.expand_dims(inside, -1), index, 0)
-        found = np.where(inside, smooth[tuple(np.moveaxis(index, -1, 0))], np.nan)
-        return torch.from_numpy(found.astype(np.float32)).to(points.device)
+        known, order = CellGrid.keys_of(torch.from_numpy(self.cells)).sort()
+        values = torch.from_numpy(self.values)[order]
+        keys = CellGrid(torch.from_numpy(self.origin), self.edge).keys(points.detach().cpu())
+        total, count = torch.zeros(keys.shape), torch.zeros(keys.shape)
+        for step in NEIGHBOURS:
+            rows, is_there = find_keys(known, keys + step)
+            total += values[rows].where(is_there, 0)
+            count += is_there
+        return (total / count).to(points.device)  # 0 / 0 is NaN
 
     def write(self, run: Path) -> None:
         """Write it into the folder of a run."""
