@@ -19,7 +19,7 @@ from unmix_plugin.spectral.colour.conversion import illuminant_power, linear_to_
 from unmix_plugin.spectral.library.material_library import measured_library
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable
 from unmix_plugin.spectral.sensor import SpectralResponses
-from unmix_plugin.trained.outputs import OUTPUTS
+from unmix_plugin.trained.plain_outputs import OUTPUTS
 
 BANDS = Bands.of(WAVELENGTHS_NM)
 VISIBLE = Bands.of(np.linspace(400, 700, 31))

@@ -16,7 +16,7 @@ from tests.factories.scenes import ring_poses
 from unmix_plugin.products.render.cameras import RenderCameras
 from unmix_plugin.products.render.files import FormattedOutput, choose_formats
 from unmix_plugin.products.render.job import RenderJob, Survey, take_survey
-from unmix_plugin.trained.outputs import values_of
+from unmix_plugin.trained.mixture_view import values_of
 from unmix_plugin.trained.run_views import RunView
 
 SCENE = make_scene()

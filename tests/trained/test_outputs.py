@@ -15,8 +15,9 @@ from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.products.render.job import needs_survey, take_survey
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.features import continuum_removed, derivative_matrix
+from unmix_plugin.trained.mixture_view import usual_range
 from unmix_plugin.trained.model_scene import model_scene
-from unmix_plugin.trained.outputs import OUTPUTS, usual_range
+from unmix_plugin.trained.plain_outputs import OUTPUTS
 from unmix_plugin.trained.protocol import RenderableScene, RenderedView
 from unmix_plugin.trained.trained_scene import MaterialView
 from unmix_plugin.trained.unexplained_map import UnexplainedMap

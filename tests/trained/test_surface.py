@@ -9,7 +9,7 @@ from tests.factories import ball_model
 from tests.factories.scenes import cameras_of
 from unmix_plugin.products.mesh import gltf_content
 from unmix_plugin.spectral.materials import Coefficients
-from unmix_plugin.trained.outputs import OUTPUTS
+from unmix_plugin.trained.plain_outputs import OUTPUTS
 from unmix_plugin.trained.surface import SurfaceAppearance, in_image, look_from_above, sample_field
 from unmix_plugin.trained.surface_mesh import TriangleMesh
 from unmix_plugin.trained.trained_scene import MaterialView

@@ -8,7 +8,7 @@ from pathlib import Path
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.products.render.files import Rows, choose_formats, is_painted, still
 from unmix_plugin.products.render.job import setting_for, take_survey
-from unmix_plugin.trained.outputs import picture_values, values_of
+from unmix_plugin.trained.mixture_view import picture_values, values_of
 from unmix_plugin.trained.run_views import RunView
 from unmix_plugin.trained.trained_scene import MaterialView
 

@@ -31,15 +31,10 @@ from unmix_plugin.spectral.intervals import COVERAGE, Interval, require_coverage
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Coefficients, Materials
 from unmix_plugin.trained.intervals import SeenPlaces, as_interval
 from unmix_plugin.trained.measures import Scale
-from unmix_plugin.trained.outputs import (
-    MaterialOutput,
-    MixtureView,
-    available_outputs,
-    components_of,
-    find_output,
-    interval_ends,
-)
+from unmix_plugin.trained.mixture_view import MaterialOutput, MixtureView, components_of
+from unmix_plugin.trained.outputs import find_output, interval_ends
 from unmix_plugin.trained.place_errors import LocalErrors, PlaceErrors
+from unmix_plugin.trained.plain_outputs import available_outputs
 from unmix_plugin.trained.protocol import Probe, RenderedView, seen_place
 from unmix_plugin.trained.run_views import RunView, cameras_of
 from unmix_plugin.trained.unexplained_map import UnexplainedMap

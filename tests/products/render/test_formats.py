@@ -8,7 +8,7 @@ from tests.factories.models import WAVELENGTHS_NM, make_scene
 from unmix_plugin.engine.outputs import Output
 from unmix_plugin.errors import UnmixError
 from unmix_plugin.products.render.files import choose_formats, file_name
-from unmix_plugin.trained.outputs import OUTPUTS
+from unmix_plugin.trained.plain_outputs import OUTPUTS
 
 SCENE = make_scene()
 

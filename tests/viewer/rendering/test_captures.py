@@ -21,8 +21,9 @@ from unmix_plugin.products.render.files import choose_formats
 from unmix_plugin.products.render.job import setting_for, take_survey
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.materials import Materials
+from unmix_plugin.trained.mixture_view import picture_values
 from unmix_plugin.trained.model_scene import LightChoice
-from unmix_plugin.trained.outputs import find_output, picture_values
+from unmix_plugin.trained.outputs import find_output
 from unmix_plugin.trained.run_views import RunView
 from unmix_plugin.viewer.rendering import captures, render_loop
 from unmix_plugin.viewer.rendering.captures import VideoJob, VideoQueue

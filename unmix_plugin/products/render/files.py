@@ -41,7 +41,7 @@ from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import rgb_matrix
 from unmix_plugin.spectral.maps.indices import NAMED_INDICES
 from unmix_plugin.spectral.segmentation import NOTHING_ID
-from unmix_plugin.trained.outputs import PictureValues
+from unmix_plugin.trained.mixture_view import PictureValues
 from unmix_plugin.trained.protocol import RenderableScene
 
 _Format = Literal["envi", "exr", "npy", "png", "mp4", "tif"]

@@ -42,7 +42,7 @@ from unmix_plugin.products.render.files import (
 )
 from unmix_plugin.products.render.maps import MapInfo
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.trained.outputs import picture_values, usual_range, values_of
+from unmix_plugin.trained.mixture_view import picture_values, usual_range, values_of
 from unmix_plugin.trained.protocol import RenderableScene
 from unmix_plugin.trained.reflectance_maps import is_reflectance_map
 from unmix_plugin.trained.run_views import RunView

@@ -29,7 +29,7 @@ from unmix_plugin.spectral.segmentation import NOTHING_ID
 from unmix_plugin.trained.evaluation import Evaluation, PredictedView, ViewTruth, as_numpy, picture
 from unmix_plugin.trained.measured_surface import MeasuredRegion
 from unmix_plugin.trained.measures import Scale, describe_area
-from unmix_plugin.trained.outputs import picture_values
+from unmix_plugin.trained.mixture_view import picture_values
 from unmix_plugin.trained.run_materials import endmember_colours, shown_matches
 from unmix_plugin.trained.run_views import RunView
 from unmix_plugin.trained.trained_scene import TrainedScene

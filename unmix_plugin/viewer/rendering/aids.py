@@ -15,7 +15,7 @@ from unmix_plugin.editing import sample_seen
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.spectral.materials import Coefficients, Materials
 from unmix_plugin.spectral.subspace import PcaColours
-from unmix_plugin.trained.outputs import components_of
+from unmix_plugin.trained.mixture_view import components_of
 from unmix_plugin.trained.trained_scene import MaterialView, TrainedScene, reference_rays
 from unmix_plugin.viewer.rendering.scene import STEPS_KEPT, CachedByVersion, MeasuredViews, SceneSource
 

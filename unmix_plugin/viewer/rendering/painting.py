@@ -18,7 +18,9 @@ from unmix_plugin.figures.paint import ColourScale, Legend, Painted, colour_tabl
 from unmix_plugin.figures.plotting import css_colour
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION
-from unmix_plugin.trained.outputs import FAMILIES, OUTPUTS, PictureValues, picture_values, usual_range
+from unmix_plugin.trained.mixture_view import PictureValues, picture_values, usual_range
+from unmix_plugin.trained.outputs import FAMILIES
+from unmix_plugin.trained.plain_outputs import OUTPUTS
 from unmix_plugin.trained.protocol import RenderableScene, RenderedView
 from unmix_plugin.trained.trained_scene import MaterialView, material_view
 from unmix_plugin.viewer.page import BLOCK_STYLE, paragraph, swatches
