@@ -18,7 +18,7 @@ from unmix_plugin.figures.paint import ColourScale, colour_table
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb
 from unmix_plugin.spectral.maps.indices import _MAX_LENGTH
 from unmix_plugin.spectral.materials import Coefficients
-from unmix_plugin.trained import outputs
+from unmix_plugin.trained import mixture_view
 from unmix_plugin.trained.run_materials import endmember_colours
 from unmix_plugin.viewer.rendering import settings
 from unmix_plugin.viewer.rendering.painting import LAYERS
@@ -211,7 +211,7 @@ FORMULA = "(r650-r450)/(r650+r450)"
 
 @pytest.mark.parametrize("light", [None, [0.2, 0.4, 0.6, 0.8, 1.0]])
 def test_an_index_is_the_output_of_renders_over_the_background(frame, aids, light, monkeypatch):
-    monkeypatch.setattr(outputs, "_CHUNK", 100)  # fewer than there are pixels
+    monkeypatch.setattr(mixture_view, "_CHUNK", 100)  # fewer than there are pixels
     lit = replace(frame.materials, light=None if light is None else torch.tensor(light))
     shown = replace(frame, scene=replace(frame.scene, materials=lit))
     values = shown[f"index:{FORMULA}"]
