@@ -40,13 +40,6 @@ def light_through(
     )
 
 
-def _pca(view: MixtureView) -> Tensor:
-    seen = view.coefficients.flatten()
-    return shown_components(
-        view, components_of(view.materials, seen.map(lambda packed: packed[seen.is_occupied]))
-    )
-
-
 def _of_lit_bands(function: Callable[[Tensor, np.ndarray], Tensor]) -> Callable[[MixtureView], Tensor]:
     """A function of reflectances and their wavelengths, over the bands with light; NaN in the others."""
 
@@ -87,6 +80,12 @@ def _table() -> tuple[MaterialOutput, ...]:
         light_through(rgb_matrix, specular=False),
         light_through(rgb_matrix, diffuse=False),
     )
+
+    def pca(view: MixtureView) -> Tensor:
+        seen = view.coefficients.flatten()
+        occupied = seen.map(lambda packed: packed[seen.is_occupied])
+        return shown_components(view, components_of(view.materials, occupied))
+
     needs_light: frozenset[Capability] = frozenset({"light"})
     return (
         row(
@@ -252,7 +251,7 @@ def _table() -> tuple[MaterialOutput, ...]:
             "three principal components of the spectra",
             legend="red, green, blue: first, second, third principal component of the spectra",
             remarks=("each stretched from its 1st to its 99th percentile",),
-            compute=_pca,
+            compute=pca,
         ),
         row(
             "depth",

@@ -138,7 +138,9 @@ def surface_of(
         # Past an outline distances jump, and a blur of the whole jump would move the surface inwards.
         most = max(1.0, grid.cell / scene.pixel_size)
         distances = gaussian_filter(distances.clip(-most, most), smoothing_px * scene.pixel_size / grid.cell)
-        distances = np.pad(distances, 1, constant_values=20 * most)  # the box ends what is solid, at its faces
+        distances = np.pad(
+            distances, 1, constant_values=20 * most
+        )  # the box ends what is solid, at its faces
         distances[np.abs(distances) < 1e-3] = 1e-3  # or triangles without area would tear the mesh
         if not distances.min() < 0 < distances.max():
             raise RunError("no camera of the run sees a surface: train longer, or there is nothing to export")

@@ -143,7 +143,9 @@ def find_unexplained(trained: TrainedScene, views: Iterable[ThinnedView]) -> Une
     along = (measured * direction[cell_of]).sum(axis=1, keepdims=True)
     across = ((measured - along * direction[cell_of]) ** 2).sum(axis=1)
     variance = np.bincount(cell_of, across, len(cells)) / np.maximum(counts * (counts - 1), 1)
-    left = mean[usable] - _nearest_mixtures(mean[usable], trained.materials)
+    # The mixtures of the endmembers, in any brightness, that come nearest.
+    known_spectra = trained.materials.endmembers.detach().double().cpu()
+    left = mean[usable] - (nnls(torch.from_numpy(mean[usable]), known_spectra) @ known_spectra).numpy()
     squares = (left**2).sum(axis=1)
     part = np.sqrt(np.maximum(squares - variance[usable], 0)) / length[usable]
 
@@ -174,14 +176,6 @@ def find_unexplained(trained: TrainedScene, views: Iterable[ThinnedView]) -> Une
         median,
         len(trained.materials.names),
     )
-
-
-def _nearest_mixtures(
-    spectra: Float64[np.ndarray, "C B"], materials: Materials
-) -> Float64[np.ndarray, "C B"]:
-    """The mixtures of the endmembers, in any brightness, that come nearest."""
-    known = materials.endmembers.detach().double().cpu()
-    return (nnls(torch.from_numpy(spectra), known) @ known).numpy()
 
 
 def _touching(

@@ -132,20 +132,16 @@ def _stored_figures(job: Job) -> dict[str, Any] | None:
     return found
 
 
-def _aligned_in_words(job: Job) -> str:
-    """What of a view is fitted to what was measured of it before they are compared."""
-    fitted = {"pose": "pose", "gain": "exposure and white balance"}
-    words = " and ".join(fitted[what] for what in job.scene.fitted)
-    return f", each aligned first in {words}" if words else ""
-
-
 def _page(job: Job, views: ReportViews, library: MaterialLibrary, about: Mapping[str, str]) -> dict[str, Any]:
     """What the report says; with the figures that `unmix-eval` stored, or else those of `views` that were compared."""
     loaded, materials, light = job.loaded, views.materials, job.scene.light_power
     figures, source = _stored_figures(job), "From the run's eval/metrics.json."
     if figures is None and views.evaluation is not None:
         figures = finite_or_none(views.evaluation.figures())
-        source = f"Of the {len(views.shown)} views rendered for this report{_aligned_in_words(job)}."
+        fitted = {"pose": "pose", "gain": "exposure and white balance"}
+        words = " and ".join(fitted[what] for what in job.scene.fitted)
+        aligned = f", each aligned first in {words}" if words else ""
+        source = f"Of the {len(views.shown)} views rendered for this report{aligned}."
     truth = _true_materials(loaded, light)
     cards = material_cards(materials, views.proportions, light, library, truth)
     unknown = [name for name in DEFINITIONS if figures is not None and figures.get(name, 0) is None]
@@ -216,17 +212,16 @@ _LARGEST_SIDE_PX = 640
 
 def _render_page(values: Mapping[str, Any]) -> str:
     """The template filled in; text is escaped."""
-    filters = {"css": css_colour, "png": _png_url, "svg": _svg_url}
+
+    def svg_url(chart: SpectraChart) -> str:
+        return f"data:image/svg+xml;base64,{base64.b64encode(draw_chart(chart)).decode()}"
+
+    filters = {"css": css_colour, "png": _png_url, "svg": svg_url}
     return fill_template("unmix_plugin.products.report", "report.html", values, filters)
 
 
 def _png_url(image: Float[np.ndarray, "H W 3"] | UInt8[np.ndarray, "H W 3"]) -> str:
     return picture_url(image, _LARGEST_SIDE_PX)
-
-
-def _svg_url(chart: SpectraChart) -> str:
-    """A chart as a URL with the drawing in it."""
-    return f"data:image/svg+xml;base64,{base64.b64encode(draw_chart(chart)).decode()}"
 
 
 _PACKAGES = ("torch", "warp-lang", "numpy", "scipy", "scikit-image", "colour-science", "matplotlib", "pillow")

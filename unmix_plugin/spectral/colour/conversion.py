@@ -165,15 +165,11 @@ def _tables() -> dict[str, tuple[Bands, Float64[np.ndarray, " N"]]]:
     }
     low, high = _FORMULA_RANGE_NM
     wavelengths = np.arange(low, high + 1, 5.0)
-    tables["A"] = (Bands.of(wavelengths), _incandescent(wavelengths))
+    # CIE illuminant A, 100 at 560 nm: the black body of CIE 15:2018, given there for 300-830 nm, and good beyond.
+    radiation = np.expm1(1.435e7 / (2848.0 * 560.0)) / np.expm1(1.435e7 / (2848.0 * wavelengths))
+    tables["A"] = (Bands.of(wavelengths), 100.0 * (560.0 / wavelengths) ** 5 * radiation)
     tables["E"] = (Bands.of([low, high]), np.ones(2))
     return tables
-
-
-def _incandescent(wavelengths_nm: Float64[np.ndarray, " N"]) -> Float64[np.ndarray, " N"]:
-    """CIE illuminant A, 100 at 560 nm: the black body of CIE 15:2018, given there for 300-830 nm, and good beyond."""
-    radiation = np.expm1(1.435e7 / (2848.0 * 560.0)) / np.expm1(1.435e7 / (2848.0 * wavelengths_nm))
-    return 100.0 * (560.0 / wavelengths_nm) ** 5 * radiation
 
 
 def colour_mode(bands: Bands) -> Literal["true-colour", "false-colour"]:

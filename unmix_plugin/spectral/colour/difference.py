@@ -121,18 +121,10 @@ def metameric_pairs(
             "adapts to it; leave it out"
         )
     first, second = np.triu_indices(len(reflectance), k=1)
-    differences = _pair_differences(reflectance, lights, bands)
+    labs = [reflectance_to_lab(reflectance, light, bands) for light in lights]
+    differences = np.stack([ciede2000(lab[first], lab[second]) for lab in labs], axis=1)
     chosen = (differences.min(axis=1) <= alike) & (differences.max(axis=1) >= different)
     order = np.flatnonzero(chosen)[np.argsort(-differences[chosen].max(axis=1), kind="stable")]
     return [
         MetamericPair(int(first[row]), int(second[row]), tuple(differences[row].tolist())) for row in order
     ]
-
-
-def _pair_differences(
-    reflectance: Float64[np.ndarray, "N B"], lights: Float64[np.ndarray, "L B"], bands: Bands
-) -> Float64[np.ndarray, "P L"]:
-    """CIEDE2000 of every pair of surfaces in every light; pairs in the order of `numpy.triu_indices(N, 1)`."""
-    first, second = np.triu_indices(len(reflectance), k=1)
-    labs = [reflectance_to_lab(reflectance, light, bands) for light in lights]
-    return np.stack([ciede2000(lab[first], lab[second]) for lab in labs], axis=1)

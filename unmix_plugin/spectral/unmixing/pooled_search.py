@@ -112,7 +112,10 @@ def pooled_search(
         sets += _archetypes(shapes, num_endmembers, generator)
         sets += _corners_and_clusters(shapes, num_endmembers, generator)
     sets = _ranked([normalize(found.double(), dim=1) for found in sets], *measured)
-    spectra = torch.stack([_averaged(sets), *sets[:_SETS_KEPT]]) @ axes.T.double()
+    is_same = _angles(sets, sets[0]).mean(dim=-1) < _SAME_SET
+    is_same[0] = True  # by rounding, a set has a small angle to itself
+    mean = normalize(torch.stack(sets)[is_same].mean(dim=0), dim=1)
+    spectra = torch.stack([mean, *sets[:_SETS_KEPT]]) @ axes.T.double()
     spectra = normalize(spectra.clamp(min=0), dim=-1).to(pixels.dtype)
     return PooledEndmembers(spectra[0], spectra[1:])
 
@@ -201,7 +204,11 @@ def _ranked(
     order = sorted(range(len(sets)), key=misfits.__getitem__)
     good = [index for index in order if misfits[index] <= (1 + _ABOUT_AS_WELL) * misfits[order[0]]]
     matched = {index: [_matched(sets[index], other) for other in sets] for index in good}
-    chosen = max(good, key=lambda index: _support(matched[index], sets[index]))
+    # How many spectra of the sets speak for one of a set's, those that are not quite alike in part.
+    support = {
+        index: torch.exp(-((_angles(matched[index], sets[index]) / _SIMILAR) ** 2)).sum() for index in good
+    }
+    chosen = max(good, key=lambda index: float(support[index]))
     return [matched[chosen][index] for index in (chosen, *(index for index in order if index != chosen))]
 
 
@@ -212,18 +219,6 @@ def _matched(best: Float[Tensor, "K d"], other: Float[Tensor, "K d"]) -> Float[T
     return other[linear_sum_assignment(-(best @ other.T).cpu().numpy())[1]]
 
 
-def _support(sets: list[Float[Tensor, "K d"]], of: Float[Tensor, "K d"]) -> float:
-    """How many spectra of the sets speak for one of a set's, those that are not quite alike in part."""
-    return float(torch.exp(-((_angles(sets, of) / _SIMILAR) ** 2)).sum())
-
-
 def _angles(sets: list[Float[Tensor, "K d"]], to: Float[Tensor, "K d"]) -> Float[Tensor, "S K"]:
     """Of the spectra of each set to those of another."""
     return (torch.stack(sets) * to).sum(dim=-1).clamp(-1, 1).arccos()
-
-
-def _averaged(sets: list[Float[Tensor, "K d"]]) -> Float[Tensor, "K d"]:
-    """Mean of the first set and of others that are nearly the same."""
-    is_same = _angles(sets, sets[0]).mean(dim=-1) < _SAME_SET
-    is_same[0] = True  # by rounding, a set has a small angle to itself
-    return normalize(torch.stack(sets)[is_same].mean(dim=0), dim=1)
