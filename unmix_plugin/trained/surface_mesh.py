@@ -38,6 +38,8 @@ _AREA_RINGS = 4
 """Neighbours over which normals along which areas are taken are smoothed."""
 _HEALED_RINGS = 3
 """Gaps of this many vertices between what is seen are not cut: two cameras rarely agree at an edge."""
+_LARGEST_HOLE_PX = 8.0
+"""Edge of a square as large as unseen parts that stay: within what is seen they are dents under highlights, mostly."""
 _SMALLEST_PART, _LEAST_FACES = 0.01, 8
 """Pieces with fewer faces than this part of those of the largest, or than so many, are stray."""
 _NUM_RAYS = 400_000
@@ -158,6 +160,10 @@ def surface_of(
         for _ in range(_HEALED_RINGS):
             is_seen = is_seen | np.asarray(links @ is_seen.astype(np.float64) > 0)
         shown, areas = np.all(is_seen[mesh.faces], axis=1, keepdims=False), mesh.areas()
+        hidden = np.flatnonzero(~shown)
+        patch = TriangleMesh(mesh.vertices, mesh.faces[hidden]).pieces()
+        is_hole = np.bincount(patch, areas[hidden]) < (_LARGEST_HOLE_PX * scene.pixel_size) ** 2
+        shown[hidden] = is_hole[patch]
         unseen = float(areas[~shown].sum() / max(areas.sum(), 1e-30))
         if not keeps_unseen:
             mesh = without_stray_pieces(mesh.select(shown))
