@@ -17,7 +17,7 @@ from unmix_plugin.commands.view import ViewOptions, prepared
 from unmix_plugin.viewer.access import ViewerOptions
 from unmix_plugin.viewer.rendering.painting import LAYERS
 
-pytestmark = NEEDS_BROWSER
+pytestmark = [pytest.mark.slow, NEEDS_BROWSER]
 
 WIDTH, HEIGHT, PANEL = 1000, 420, 400
 WAIT_MS = 60_000
@@ -160,7 +160,6 @@ def test_a_run_is_looked_at_probed_edited_and_saved(viewer, browser):
     browser.keep("captured")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("size", [(1280, 800), (1440, 900)])
 def test_tabs_lie_in_one_row_and_the_object_in_the_part_beside_them(browser, size):
     width, height = size
@@ -187,7 +186,6 @@ def test_tabs_lie_in_one_row_and_the_object_in_the_part_beside_them(browser, siz
     assert abs((found.min() + found.max()) / 2 - 0.5) < 0.1
 
 
-@pytest.mark.slow
 def test_a_browser_gives_the_token_once_and_is_let_in(tmp_path):
     from playwright.sync_api import sync_playwright
 
