@@ -38,7 +38,7 @@ from unmix_plugin.light.lamp import Lamp
 from unmix_plugin.light.shading import ShadowDetail
 from unmix_plugin.losses.abundance_guide import AbundanceGuide, first_endmembers, first_specular_spectra
 from unmix_plugin.losses.comparison import BatchComparison, ComparedPixels
-from unmix_plugin.losses.terms import loss_weights, normals_error, stray_light
+from unmix_plugin.losses.terms import light_near_cameras, loss_weights, normals_error, stray_light
 from unmix_plugin.operators.occupancy import OccupancyGrid
 from unmix_plugin.poses.refinement import PoseRefinement
 from unmix_plugin.poses.training import CorrectedRays, PoseTraining
@@ -362,6 +362,9 @@ class UnmixModel(Model):
         if "surface" in weights and (known := [each for each in surfaces if each is not None]):
             light = (rendered.weights, rendered.positions, rendered.ray_indices)
             losses["surface"] = stray_light(*light, torch.cat(known), self.renderer.space)
+        if "near" in weights:
+            seen = (rendered.weights, rendered.positions, step.corrected.rays)
+            losses["near"] = light_near_cameras(*seen, self.renderer.space)
         shading = self.field.lamp_shading if isinstance(self.field, UnmixField) else None
         if "normals" in weights and shading is not None:
             places = self.renderer.space.from_unit(rendered.positions)

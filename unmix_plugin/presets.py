@@ -34,6 +34,7 @@ class AlphaPreset:
     opacity_loss_weight: float = 0.0
     sparsity_loss_weight: float = 0.0
     surface_loss_weight: float = 0.0
+    near_loss_weight: float = 0.0
     coarse_samples: int = 256
     is_carved: bool = True
     """Whether pictures tell where nothing is."""
@@ -54,7 +55,14 @@ WITHOUT_ALPHA = AlphaPreset(
     is_carved=False,
     specular_endmembers=True,
 )
-UNBOUNDED = replace(WITHOUT_ALPHA, initial_opacity=0.005, surface_loss_weight=0.3, coarse_samples=64)
+UNBOUNDED = replace(
+    WITHOUT_ALPHA,
+    initial_opacity=0.005,
+    opacity_loss_weight=0.002,  # what is bright may be the sky, which floaters would hide
+    surface_loss_weight=0.3,
+    near_loss_weight=0.005,
+    coarse_samples=64,
+)
 BEFORE_BACKDROP = replace(WITH_ALPHA, background="black")
 
 

@@ -4,9 +4,9 @@ from torch import nn
 
 from tests.factories.models import BOX, NUM_BANDS, losses_of, make_model, make_rays
 from tests.light.test_lamp import model_with_lamp
-from unmix_plugin.engine.geometry.space import UnitSpace
+from unmix_plugin.engine.geometry.space import RayBundle, UnitSpace
 from unmix_plugin.light.shading import LampShading
-from unmix_plugin.losses.terms import normals_error, stray_light
+from unmix_plugin.losses.terms import light_near_cameras, normals_error, stray_light
 from unmix_plugin.model import UnmixModel
 
 SPACE = UnitSpace(BOX, is_unbounded=True)
@@ -53,6 +53,20 @@ def test_it_fades_out_and_needs_pixels_with_known_surfaces():
         assert "surface" not in losses_of(model, batch, *rendered)
         found.append(float(losses_of(model, guided, *rendered).get("surface", 0.0)))
     assert found == pytest.approx([0.15, 0.0375, 0.0])
+
+
+def test_light_costs_the_square_of_how_near_a_camera_it_starts():
+    origins = torch.tensor([[1.0, 0, 0], [1.0, 0, 0], [-1.0, 0, 0]])
+    rays = RayBundle(origins, -origins, torch.tensor([7, 7, 2]))
+    reach = 1.2  # both cameras stand a unit from the middle
+    places = torch.tensor([[1.0, 0, 0], [1.0 - reach / 2, 0, 0], [-1.0, reach / 2, 0], [0.0, 9.0, 0.0]])
+    weights = torch.tensor([0.5, 1.0, 1.0, 1.0], requires_grad=True)
+    found = light_near_cameras(weights, SPACE.to_unit(places), rays, SPACE)
+    assert found.item() == pytest.approx((0.5 + 0.25 + 0.25 + 0.0) / 3, abs=1e-4)
+    found.backward()
+    assert weights.grad is not None
+    assert (weights.grad[:3] > 0).all()
+    assert weights.grad[3] == 0
 
 
 def growing_downwards(positions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -1,7 +1,7 @@
 """The terms of what training makes smaller: their weights by name, and how each is computed.
 
 `spectral`, `rgb`, `opacity` and `abundances` compare pixels (`LossTerm`, made in comparison.py); `sparsity` and
-`certainty` the renderer sums along rays; `surface` and `normals` stand here. `poses` is of poses/refinement.py.
+`certainty` the renderer sums along rays; `surface`, `near` and `normals` stand here. `poses` is of poses/refinement.py.
 
 Where the views agree clearly on the surface that a pixel shows, light of its rays should come from there (Deng et al.
 2022, Depth-supervised NeRF, with a plane sweep's distances in place of sparse points, and with a bound on what a wrong
@@ -22,7 +22,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from unmix_plugin.engine.geometry.space import UnitSpace
+from unmix_plugin.engine.geometry.space import RayBundle, UnitSpace
 from unmix_plugin.light.shading import LampShading
 from unmix_plugin.presets import AlphaPreset
 from unmix_plugin.settings import LossConfig
@@ -61,11 +61,12 @@ def loss_weights(
         "opacity": preset.opacity_loss_weight,
         "sparsity": preset.sparsity_loss_weight * fading(_SPARSITY_PART),
         "surface": preset.surface_loss_weight * fading(_SURFACE_PART),
+        "near": preset.near_loss_weight,
         "normals": _NORMALS_WEIGHT * fading(1.0),
         "certainty": _CERTAINTY_WEIGHT * fading(_CERTAINTY_PART),
         "abundances": config.abundances * _FINAL_ABUNDANCES**progress,
     }
-    unknown_then = ("opacity", "sparsity", "surface", "certainty") if as_published else ()
+    unknown_then = ("opacity", "sparsity", "surface", "near", "certainty") if as_published else ()
     return {name: x for name, x in weights.items() if x > 0 and name not in unknown_then}
 
 
@@ -113,6 +114,29 @@ def stray_light(
     counted = ((_OFF_SURFACE - away) / (_OFF_SURFACE - _AT_SURFACE)).clamp(0.0, 1.0)
     light = torch.zeros_like(surfaces[:, 0]).index_add(0, ray_indices, weights * counted)
     return torch.where(is_known, 1.0 - light, 0.0).mean()
+
+
+_NEAR_REACH = 1.2
+"""Distance from a camera within which light counts as from near it, in distances of cameras from the middle of the box,
+median over them."""
+_MOST_CAMERAS = 64
+
+
+def light_near_cameras(
+    weights: Float[Tensor, "S"], positions: Float[Tensor, "S 3"], rays: RayBundle, space: UnitSpace
+) -> Float[Tensor, ""]:
+    """Mean over rays of the light that samples at positions of the unit cube send, by how near they are to any of the
+    rays' cameras: (1 - d / r)^2 within r of the nearest.
+
+    What is as well explained by something farther away, as a plain sky is, does not hang in the air between cameras.
+    """
+    views = rays.camera_indices
+    firsts = torch.searchsorted(views.sort().values, views.unique())
+    cameras = rays.origins.detach()[views.argsort(stable=True)[firsts]]
+    cameras = cameras[:: -(-len(cameras) // _MOST_CAMERAS)]
+    reach = _NEAR_REACH * (cameras - space.box.aabb.mean(dim=0)).norm(dim=-1).median()
+    nearest = torch.cdist(space.from_unit(positions), cameras).amin(dim=1)
+    return (weights * (1 - nearest / reach).clamp(min=0).square()).sum() / max(len(rays), 1)
 
 
 _ONE_OF = 8

@@ -68,3 +68,13 @@ def test_cells_that_one_view_alone_sees_are_carved_and_those_that_many_see_are_n
     points = torch.tensor([[0.0, 0.0, 0.0], [-30.0, 0.0, 0.0], [2.2, -1.0, 0.3], [8.0, 0.0, 0.0]])
     cells = (UnitSpace(BOX, is_unbounded=True).to_unit(points) * 32).long()
     assert kept[tuple(cells.T.numpy())].tolist() == [True, True, False, False]
+
+
+@pytest.mark.parametrize(("beside", "is_kept"), [(0, False), (1, False), (2, True)])
+def test_what_is_near_a_camera_must_be_seen_by_others_from_its_side(beside, is_kept):
+    """Views from the other side see the place too, but hold nothing that fits the nearest picture alone."""
+    nearest = [np.array([3.0, 0.2 * index, 0.3]) for index in range(1 + beside)]
+    opposite = [np.array([-3.0, side, 0.3]) for side in (-0.6, -0.2, 0.2, 0.6)]
+    cameras = make_cameras([look_at(position, np.zeros(3)) for position in nearest + opposite])
+    place = UnitSpace(BOX, is_unbounded=True).to_unit(torch.tensor([1.5, 0.02, 0.16]))
+    assert _carve_world(cameras, BOX, 32)[tuple((place * 32).long())] == is_kept

@@ -72,6 +72,12 @@ _WORLD_SHARE = 0.05
 """Share of the training views that must see a cell, but two of them at least."""
 _NEAR_SHARE = 0.2
 """The same of cells near a camera."""
+_BESIDE_SHARE = 0.12
+"""Share of the training views, but three of them at least, that must see a cell near a camera from the side from which
+the nearest camera sees it. Views from the other side see another side of what is there, and hold nothing that fits the
+nearest picture alone."""
+_ONE_SIDE = 0.5
+"""Cosine of the angle between views from one side, at least."""
 _NEAR_DISTANCE = 0.6
 """What is near, in distances from the cameras to the middle of the box, median over cameras."""
 _BLOCK_POINTS = 1 << 16
@@ -334,13 +340,28 @@ def _carve_world(cameras: Cameras, box: SceneBox, resolution: int) -> Cells:
     positions = cameras.camera_to_world[:, :, 3]
     limit = _NEAR_DISTANCE * float((positions - box.aabb.mean(dim=0)).norm(dim=-1).median())
     nearest = torch.cat([torch.cdist(part, positions).amin(dim=1) for part in points.split(_BLOCK_POINTS)])
-    near, far = (
-        min(max(2, math.ceil(share * len(cameras))), len(cameras)) for share in (_NEAR_SHARE, _WORLD_SHARE)
+    near, far, beside = (
+        min(max(fewest, math.ceil(share * len(cameras))), len(cameras))
+        for fewest, share in ((2, _NEAR_SHARE), (2, _WORLD_SHARE), (3, _BESIDE_SHARE))
     )
-    kept = (seen_by >= torch.where(nearest < limit, near, far)).view(1, 1, cells, cells, cells)
+    kept = seen_by >= torch.where(nearest < limit, near, far)
+    asked = (kept & (nearest < limit)).nonzero()[:, 0]
+    for part in asked.split(_BLOCK_POINTS // 8):
+        kept[part] = _count_beside_nearest(cameras, points[part]) >= beside
+    kept = kept.view(1, 1, cells, cells, cells)
     # A cell counts by its centre, so those beside one that is seen may be seen in part.
     grown = torch.nn.functional.max_pool3d(kept.float(), 3, stride=1, padding=1)[0, 0] > 0
     return refined(grown, resolution).numpy()
+
+
+def _count_beside_nearest(cameras: Cameras, points: Float[Tensor, "P 3"]) -> Int64[Tensor, " P"]:
+    """How many cameras see each point from the side from which the nearest of them does, that one included."""
+    is_seen = torch.stack([look_up(cameras, index, points)[2] for index in range(len(cameras))])
+    towards = cameras.camera_to_world[:, None, :, 3] - points
+    nearest = towards.norm(dim=-1).masked_fill(~is_seen, torch.inf).argmin(dim=0)
+    towards = torch.nn.functional.normalize(towards, dim=-1) * is_seen[..., None]
+    first = towards[nearest, torch.arange(len(points))]
+    return ((towards * first).sum(dim=-1) > _ONE_SIDE).sum(dim=0)
 
 
 def unit_centres(cells: int) -> Float[Tensor, "M 3"]:
