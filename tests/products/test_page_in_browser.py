@@ -189,7 +189,7 @@ def test_a_band_is_reflectance_only_in_a_light_of_1(opened):
     opened.evaluate("unmixPage.choose('band')")
     for light, quantity in (("D65: noon daylight, 6504 K", "radiance"), ("the scene's own", "reflectance")):
         opened.select_option("#light", label=light)
-        opened.wait_for_function(f"document.getElementById('about').textContent.startsWith('{quantity} at')")
+        opened.locator("#about", has_text=f"{quantity} at").wait_for()
 
 
 def test_a_region_is_what_is_seen_inside_an_outline_and_is_saved(opened):
@@ -198,7 +198,7 @@ def test_a_region_is_what_is_seen_inside_an_outline_and_is_saved(opened):
     (*_, seen) = probes(opened, "area", "mixture")
     # From three radii away one sees a little less than the half that faces the eye.
     distance = opened.evaluate("1.06 / Math.sin(20 * Math.PI / 180)")
-    assert seen["area"] == pytest.approx(2 * np.pi * WORLD_RADIUS**2 * (1 - 1 / distance), rel=0.08)
+    assert seen["area"] == pytest.approx(2 * np.pi * WORLD_RADIUS**2 * (1 - 1 / distance), rel=0.1)
     opened.locator(".probe input[type=text]").first.fill('my "part", 1')
     opened.locator(".probe input[type=text]").first.press("Enter")
     table = list(csv.reader(io.StringIO(opened.evaluate("unmixPage.csvText()"))))
@@ -352,9 +352,7 @@ def test_notes_at_places_travel_in_copies_of_the_page(exported, browser, tmp_pat
         opened.keyboard.type(NOTE)
         place = opened.evaluate("unmixPage.pick(285, 300).place.toArray()")
         opened.locator("#notes input[type=file]").set_input_files(tmp_path / "none.png")
-        opened.wait_for_function(
-            "document.querySelector('#noted').textContent.startsWith('none.png is no picture')"
-        )
+        opened.locator("#noted", has_text="none.png is no picture").wait_for()
         opened.locator("#notes input[type=file]").set_input_files(tmp_path / "picture.png")
         opened.wait_for_selector("#notes img")
         before = opened.evaluate(stored)

@@ -97,3 +97,10 @@ def test_nothing_seen_is_refused(monkeypatch):
         surface_of(SCENE)
     with pytest.raises(ConfigError, match="--resolution is 4; choose 8 to 1024"):
         surface_of(SCENE, 4)
+
+
+def test_pieces_that_no_camera_sees_are_no_holes_of_the_surface():
+    """What corners of the box hide from all cameras counts as solid, but is no part of a ball in the middle."""
+    mesh, _ = surface_of(ball_scene(), 48)
+    assert np.unique(mesh.pieces()).tolist() == [0]
+    assert np.abs(mesh.vertices).max() < 0.7

@@ -163,7 +163,9 @@ def surface_of(
         hidden = np.flatnonzero(~shown)
         patch = TriangleMesh(mesh.vertices, mesh.faces[hidden]).pieces()
         is_hole = np.bincount(patch, areas[hidden]) < (_LARGEST_HOLE_PX * scene.pixel_size) ** 2
-        shown[hidden] = is_hole[patch]
+        piece = mesh.pieces()
+        is_met = np.bincount(piece, shown) > 0  # a hole lies within what is seen
+        shown[hidden] = is_hole[patch] & is_met[piece[hidden]]
         unseen = float(areas[~shown].sum() / max(areas.sum(), 1e-30))
         if not keeps_unseen:
             mesh = without_stray_pieces(mesh.select(shown))
