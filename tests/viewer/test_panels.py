@@ -203,7 +203,7 @@ def test_two_clicks_and_a_distance_set_the_scale_that_commands_read(viewer):
 
 @pytest.mark.slow
 def test_a_region_is_drawn_named_kept_as_commands_read_it_and_removed(tmp_path):
-    source = make_source(tmp_path, initial_opacity=0.6)
+    source = make_source(tmp_path, initial_opacity=0.95)
 
     def kept():
         region = read_measures(source.run).regions["middle part"]
