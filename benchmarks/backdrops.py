@@ -116,7 +116,7 @@ def measure(capture: Path, mask: str, options: Options) -> dict[str, Any]:
         _common.console_script(f"unmix-{name}") for name in ("process", "train", "eval")
     )
     poses = str(capture / POSES) if options.poses == "true" else options.poses
-    words = ["cubes", "--data", str(capture), "--output", str(scene), "--poses", poses, "--mask", mask]
+    words = ["cubes", "--data", str(capture), "--output-dir", str(scene), "--poses", poses, "--mask", mask]
     if not scene.is_dir():
         _common.run_command([process, *words])
     record = json.loads((scene / "process.json").read_text(encoding="utf-8"))

@@ -97,7 +97,7 @@ def make_capture(folder: Path, size: int, views: int) -> float:
 
 def process(capture: Path, scene: Path, poses: str, mask: str) -> float:
     """Make a scene of the capture; seconds."""
-    words = ["cubes", "--data", str(capture), "--output", str(scene), "--poses", poses, "--mask", mask]
+    words = ["cubes", "--data", str(capture), "--output-dir", str(scene), "--poses", poses, "--mask", mask]
     for what in ("white", "dark"):
         words += [f"--{what}", str(capture / f"{what}.hdr")]
     print(f"{scene.name} poses: processing ...", flush=True)

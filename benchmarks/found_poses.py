@@ -161,7 +161,7 @@ def make_ring(capture: Path) -> None:
 
 def process(capture: Path, scene: Path, *poses: str) -> str | None:
     """Make a scene of a raw capture; what was said if it was refused."""
-    words = ["cubes", "--data", str(capture), "--output", str(scene), "--mask", "black", "--overwrite"]
+    words = ["cubes", "--data", str(capture), "--output-dir", str(scene), "--mask", "black", "--overwrite"]
     for what in ("white", "dark"):
         words += [f"--{what}", str(capture / f"{what}.hdr")]
     return attempt([*words, "--poses", *poses])
@@ -224,7 +224,7 @@ def on_turntable(options: Options) -> dict[str, Any]:
             "cubes",
             "--data",
             str(capture),
-            "--output",
+            "--output-dir",
             str(scene),
             "--mask",
             "files",
@@ -264,7 +264,7 @@ def on_basil(options: Options) -> dict[str, Any]:
         "cubes",
         "--data",
         str(made / "images"),
-        "--output",
+        "--output-dir",
         str(scene),
         "--wavelengths",
         WAVELENGTHS,

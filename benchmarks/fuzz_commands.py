@@ -140,7 +140,7 @@ def make_folders(place: Path) -> dict[str, tuple[str, ...]]:
     words = {}
 
     def add(name: str, layout: str, *more: str) -> Path:
-        words[name] = (layout, "--data", "IN", "--output", "OUT", *more)
+        words[name] = (layout, "--data", "IN", "--output-dir", "OUT", *more)
         return place / name
 
     own = ("--poses", "IN/transforms.json", "--mask", "none")

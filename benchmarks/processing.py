@@ -145,7 +145,7 @@ def _pose(angle: float) -> list[list[float]]:
 def _start(root: Path, until: int) -> Start:
     """Start the command, and kill it when so many views are written."""
     command = [sys.executable, "-c", "from unmix_plugin.commands import scripts; scripts.process()", "cubes"]
-    command += ["--data", str(root / "capture"), "--output", str(root / "scene"), "--mask", "black"]
+    command += ["--data", str(root / "capture"), "--output-dir", str(root / "scene"), "--mask", "black"]
     command += ["--poses", "transforms.json", "--max-noise", "10"]
     command += ["--white", str(root / "capture/white.hdr"), "--dark", str(root / "capture/dark.hdr")]
     views = root / "scene.unfinished" / "views"

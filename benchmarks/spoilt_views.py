@@ -110,7 +110,7 @@ def _change_counts(header: Path, path: Path, change: Callable[[Counts], Counts])
 
 def process(capture: Path, scene: Path) -> dict[str, Any]:
     """transforms.json of the scene made of a capture."""
-    words = ["cubes", "--data", str(capture), "--output", str(scene), "--poses", str(capture / POSES)]
+    words = ["cubes", "--data", str(capture), "--output-dir", str(scene), "--poses", str(capture / POSES)]
     words += ["--white", str(capture / "white.hdr"), "--dark", str(capture / "dark.hdr"), "--mask", "none"]
     _common.run_command([_common.console_script("unmix-process"), *words])
     return json.loads((scene / "transforms.json").read_text(encoding="utf-8"))

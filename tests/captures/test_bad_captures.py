@@ -134,13 +134,13 @@ def test_a_bad_capture_is_refused(tmp_path: Path, spoil: Spoil, options: dict[st
     ],
 )
 def test_the_command_ends_with_the_users_error(tmp_path: Path, layout: str, folder: str, message: str):
-    words = ["--data", tmp_path / folder, "--output", tmp_path / "scene", "--poses", "transforms.json"]
+    words = ["--data", tmp_path / folder, "--output-dir", tmp_path / "scene", "--poses", "transforms.json"]
     assert message in refused(process_command, layout, *words)
 
 
 @pytest.mark.usefixtures("contact_sheet")
 def test_the_command_ends_with_the_name_of_the_scene(tmp_path: Path):
-    words = ["--data", make_capture(tmp_path / "capture").root, "--output", tmp_path / "scene"]
+    words = ["--data", make_capture(tmp_path / "capture").root, "--output-dir", tmp_path / "scene"]
     ended = done(process_command, "cubes", *words, "--poses", "transforms.json", "--drop-bands", "500")
     assert ended.last_line == f"scene: {tmp_path / 'scene'}"
     assert (tmp_path / "scene" / "contact-sheet.png").read_bytes().startswith(b"\x89PNG")

@@ -132,7 +132,7 @@ def test_estimated_poses_are_those_of_the_truth(tmp_path, monkeypatch):
     monkeypatch.setattr(demo_capture, "render_view", partial(render_view, subpixels=2))
     capture, scene = tmp_path / "capture", tmp_path / "scene"
     demo_capture.make_demo_capture(capture, WHOLE_SIZE, WHOLE_BANDS, WHOLE_VIEWS)
-    words = ["cubes", "--data", capture, "--output", scene, "--poses", "estimate", "--mask", "black"]
+    words = ["cubes", "--data", capture, "--output-dir", scene, "--poses", "estimate", "--mask", "black"]
     ended = done(process, *words, "--white", capture / "white.hdr", "--dark", capture / "dark.hdr")
     assert ended.last_line == f"scene: {scene}"
     found, truth = read_poses(scene / "transforms.json"), read_poses(capture / "poses-true.json")

@@ -99,7 +99,7 @@ ROTATION_ROWS = ("view_00,object,3,0,0,-1,0,0,0,0,1,0,0,0,2", "view_01,object,3,
 
 @pytest.mark.parametrize("table", [STAGES, LINE_POSES])
 def test_rays_of_the_scene_are_those_of_the_demos_camera_and_its_pixels_the_truth(demo, tmp_path, table):
-    words = ["lines", "--data", demo, "--output", tmp_path / "scene", "--poses", demo / table]
+    words = ["lines", "--data", demo, "--output-dir", tmp_path / "scene", "--poses", demo / table]
     words += ["--white", demo / "white.hdr", "--dark", demo / "dark.hdr", "--mask", "black"]
     done(process_command, *words, "--field-of-view", FIELD_OF_VIEW_DEG)
     scene = load_scene(tmp_path / "scene")

@@ -74,7 +74,7 @@ def make_scene(tmp_path, picture, views):
     for index, name in enumerate(names_of(views)):
         write_envi(tmp_path / "capture" / f"{name}.hdr", picture(index).astype(np.float32))
     write_transforms(tmp_path / "capture/transforms.json", names_of(views), ring(views), **CAMERA)
-    given = "--data", tmp_path / "capture", "--output", tmp_path / "scene", "--poses", "transforms.json"
+    given = "--data", tmp_path / "capture", "--output-dir", tmp_path / "scene", "--poses", "transforms.json"
     return run(process, "cubes", *given)
 
 

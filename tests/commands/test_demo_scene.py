@@ -57,7 +57,7 @@ def test_raw_writes_a_capture_and_names_the_command_that_makes_a_scene_of_it(tmp
     assert all((capture / name).exists() for name in shown)
     assert all(f"  {capture / name}  " in printed for name in shown)
     words = shlex.split(printed.splitlines()[-1].partition(": ")[2])
-    assert words[:6] == ["unmix-process", "cubes", "--data", str(capture), "--output", "SCENE"]
+    assert words[:6] == ["unmix-process", "cubes", "--data", str(capture), "--output-dir", "SCENE"]
     references = ["--white", f"{capture}/white.hdr", "--dark", f"{capture}/dark.hdr"]
     assert words[6:] == [*references, "--poses", "estimate"]
     assert not (capture / "transforms.json").exists()
@@ -71,7 +71,7 @@ def test_lines_writes_scans_and_names_the_command_that_makes_a_scene_of_them(tmp
     assert all((capture / name).exists() for name in shown)
     assert all(f"  {capture / name}  " in printed for name in shown)
     words = shlex.split(printed.splitlines()[-1].partition(": ")[2])
-    assert words[:6] == ["unmix-process", "lines", "--data", str(capture), "--output", "SCENE"]
+    assert words[:6] == ["unmix-process", "lines", "--data", str(capture), "--output-dir", "SCENE"]
     assert words[-4:] == ["--poses", f"{capture}/stages.csv", "--field-of-view", "38"]
     assert "give one of them" in refused(write_demo_scene, "--lines", "--raw", tmp_path / "both")
     assert "--place world" in refused(write_demo_scene, "--lines", tmp_path / "world", "--place", "world")

@@ -94,7 +94,7 @@ def test_of_an_image(tmp_path, way):
         tmp_path / "field.hdr",
         "--endmembers",
         2,
-        "--output",
+        "--output-dir",
         tmp_path / "out",
         "--overwrite",
     )
@@ -175,7 +175,7 @@ def test_of_a_raw_capture_that_is_called_like_what_a_scene_is_moved_to(capture, 
         data = Path(shutil.copytree(capture.root, tmp_path / name))
         before = snapshot(data)
         for more in ([], ["--overwrite"]):
-            words = ["cubes", "--data", data, "--output", tmp_path / "y", *POSED, *more]
+            words = ["cubes", "--data", data, "--output-dir", tmp_path / "y", *POSED, *more]
             ended = run(process, *words)
             assert ended.status == (0 if name == "y.old" else 2), ended.err
             assert snapshot(data) == before
@@ -185,7 +185,7 @@ def test_of_a_raw_capture_that_is_called_like_what_a_scene_is_moved_to(capture, 
 
 def test_of_a_scene_that_is_made_again(capture, tmp_path):
     output = tmp_path / "scene"
-    words = ["cubes", "--data", capture.root, "--output", output, *POSED]
+    words = ["cubes", "--data", capture.root, "--output-dir", output, *POSED]
     done(process, *words)
     done(process, *words, "--overwrite")  # all of it is its own
     whole = snapshot(output)

@@ -29,7 +29,7 @@ def cube():
 def test_spectra_maps_and_shares_are_written_and_said(cube, tmp_path):
     bands = Bands.of(np.linspace(450, 900, cube.shape[2]))
     write_envi_cube(tmp_path / "field", cube, bands, None, "a field")
-    words = (tmp_path / "field.hdr", "--endmembers", 3, "--output", tmp_path / "out")
+    words = (tmp_path / "field.hdr", "--endmembers", 3, "--output-dir", tmp_path / "out")
     words += ("--library", "+builtin", "--mnf", 2)
     ended = done(image, *words)
     assert "20 x 20 pixels, 24 bands" in ended.out
@@ -65,7 +65,7 @@ def test_files_that_only_other_options_write_are_not_taken_away_unasked(cube, tm
     own = tmp_path / "field" / "mnf.hdr"
     own.parent.mkdir()
     own.write_text("of another program")
-    said = refused(image, tmp_path / "field.hdr", "--endmembers", 3, "--output", tmp_path)
+    said = refused(image, tmp_path / "field.hdr", "--endmembers", 3, "--output-dir", tmp_path)
     assert f"{own} exists already; give --overwrite" in said
     assert own.read_text() == "of another program"
 
@@ -82,14 +82,14 @@ def test_angles_are_of_radiance_unless_the_file_speaks_of_reflectance(name, fiel
     write_envi_cube(tmp_path / name, cube, Bands.of(np.linspace(450, 900, cube.shape[2])), None, "a field")
     with (tmp_path / f"{name}.hdr").open("a") as header:
         header.write(f"{field}\n")
-    words = ("--endmembers", 3, "--output", tmp_path / "out", "--library", "+builtin")
+    words = ("--endmembers", 3, "--output-dir", tmp_path / "out", "--library", "+builtin")
     assert (UNKNOWN_LIGHT not in done(image, tmp_path / f"{name}.hdr", *words).out) == is_said
 
 
 def test_bands_without_wavelengths_are_numbered_and_pixels_without_measurement_left_out(cube, tmp_path):
     cube[:4] = np.nan
     np.save(tmp_path / "plain.npy", cube)
-    ended = done(image, tmp_path / "plain.npy", "--endmembers", 3, "--axes", "yxb", "--output", tmp_path)
+    ended = done(image, tmp_path / "plain.npy", "--endmembers", 3, "--axes", "yxb", "--output-dir", tmp_path)
     assert "80 pixels without a measurement" in ended.out
     with (tmp_path / "plain" / "endmembers.csv").open() as file:
         assert next(csv.reader(file))[0] == "band"
@@ -101,7 +101,7 @@ def test_bands_that_were_measured_nowhere_are_left_out(cube, tmp_path):
     cube[:2] = -9999
     bands = Bands.of(np.linspace(450, 900, cube.shape[2]))
     write_envi_cube(tmp_path / "a", cube, bands, None, "a", {"data ignore value": -9999})
-    ended = done(image, tmp_path / "a.hdr", "--endmembers", 3, "--output", tmp_path)
+    ended = done(image, tmp_path / "a.hdr", "--endmembers", 3, "--output-dir", tmp_path)
     assert "3 bands left out" in ended.out
     assert "40 pixels without a measurement" in ended.out
     with (tmp_path / "a" / "endmembers.csv").open() as file:
@@ -111,7 +111,7 @@ def test_bands_that_were_measured_nowhere_are_left_out(cube, tmp_path):
 
 def test_a_matrix_of_bands_and_pixels_is_an_image_by_its_size(cube, tmp_path):
     savemat(tmp_path / "list.mat", {"Y": cube.reshape(-1, 24, order="F").T})
-    ended = done(image, tmp_path / "list.mat", "--size", 20, 20, "--endmembers", 3, "--output", tmp_path)
+    ended = done(image, tmp_path / "list.mat", "--size", 20, 20, "--endmembers", 3, "--output-dir", tmp_path)
     assert "20 x 20 pixels, 24 bands" in ended.out
 
 
@@ -130,7 +130,7 @@ def test_the_dark_lines_of_a_file_are_subtracted_from_raw_numbers_alone(cube, ga
         raise SpectrumError("taken")
 
     monkeypatch.setattr("unmix_plugin.spectral.unmixing.image.unmix_image", take)
-    run(image, header, "--endmembers", 3, "--output", tmp_path)
+    run(image, header, "--endmembers", 3, "--output-dir", tmp_path)
     expected = counts if gain == 1 else 2.0 * (counts + dark[:1])
     np.testing.assert_allclose(taken[0], expected[..., ::-1])
 
@@ -175,7 +175,7 @@ def test_raw_counts_become_reflectance_by_white_and_dark(cube, raw, monkeypatch)
         raw / "white.hdr",
         "--dark",
         raw / "dark.hdr",
-        "--output",
+        "--output-dir",
         raw / "out",
     )
     values, mask, said = unmixed(monkeypatch, *words, "--white-reflectance", 0.5)
@@ -189,14 +189,16 @@ def test_raw_counts_become_reflectance_by_white_and_dark(cube, raw, monkeypatch)
 
 
 def test_raw_counts_without_a_white_are_said_to_be_raw(cube, raw, monkeypatch):
-    _, _, said = unmixed(monkeypatch, raw / "view.hdr", "--output", raw / "out")
+    _, _, said = unmixed(monkeypatch, raw / "view.hdr", "--output-dir", raw / "out")
     assert "looks wrong: the numbers are raw counts" in said
     assert "give --white and --dark" in said
-    _, _, said = unmixed(monkeypatch, raw / "view.hdr", "--white", raw / "white.hdr", "--output", raw / "out")
+    _, _, said = unmixed(
+        monkeypatch, raw / "view.hdr", "--white", raw / "white.hdr", "--output-dir", raw / "out"
+    )
     assert "no dark frame" in said
     bands = Bands.of(np.linspace(450, 900, cube.shape[2]))
     write_envi_cube(raw / "field", cube, bands, None, "a field")
-    _, _, said = unmixed(monkeypatch, raw / "field.hdr", "--output", raw / "out")
+    _, _, said = unmixed(monkeypatch, raw / "field.hdr", "--output-dir", raw / "out")
     assert "raw counts" not in said
 
 
@@ -204,7 +206,7 @@ def test_pixels_that_are_black_in_a_mask_are_left_out(raw, monkeypatch):
     shown = np.zeros((20, 20), bool)
     shown[4:12, 3:17] = True
     Image.fromarray((shown * 255).astype(np.uint8)).save(raw / "mask.png")
-    words = raw / "view.hdr", "--mask", raw / "mask.png", "--output", raw / "out"
+    words = raw / "view.hdr", "--mask", raw / "mask.png", "--output-dir", raw / "out"
     _, mask, said = unmixed(monkeypatch, *words)
     np.testing.assert_array_equal(mask, shown)
     assert "pixels left out by" in said
@@ -222,7 +224,7 @@ def test_pixels_that_are_black_in_a_mask_are_left_out(raw, monkeypatch):
 )
 def test_references_that_can_t_be_are_refused(words, message, raw):
     told = [word.format(raw) for word in words]
-    assert message in refused(image, raw / "view.hdr", *told, "--output", raw / "out")
+    assert message in refused(image, raw / "view.hdr", *told, "--output-dir", raw / "out")
 
 
 @pytest.mark.parametrize(
@@ -239,7 +241,7 @@ def test_references_that_can_t_be_are_refused(words, message, raw):
 )
 def test_what_cannot_be_unmixed_ends_with_one_message(change, words, message, cube, tmp_path):
     np.save(tmp_path / "bad.npy", change(cube))
-    given = ["--axes", "yxb", "--output", tmp_path, *(words or ("--endmembers", 3))]
+    given = ["--axes", "yxb", "--output-dir", tmp_path, *(words or ("--endmembers", 3))]
     ended = run(image, tmp_path / "bad.npy", *given)
     assert (ended.status, len(ended.err.strip().splitlines())) == (2, 1)
     assert message in ended.err
@@ -252,7 +254,7 @@ def test_the_place_on_the_earth_is_kept_and_a_repeated_wavelength_left_out(cube,
     write_envi_cube(tmp_path / "field", cube, Bands.of(nm), None, "a field", on_map)
     header = (tmp_path / "field.hdr").read_text()
     (tmp_path / "field.hdr").write_text(header.replace(f"{float(nm[3])!r},", f"{float(nm[2])!r},"))
-    words = ["--endmembers", 3, "--mnf", 2, "--output", tmp_path / "out"]
+    words = ["--endmembers", 3, "--mnf", 2, "--output-dir", tmp_path / "out"]
     ended = done(image, tmp_path / "field.hdr", *words)
     assert "1 band left out: marked as bad in the file, of a wavelength that is there twice" in ended.out
     for name in ("abundances", "confidence", "mnf"):
@@ -265,7 +267,7 @@ def test_a_picture_is_unmixed_in_linear_light(tmp_path):
     light = (share * materials[0] + (1 - share) * materials[1]).repeat(4, axis=0).reshape(16, 16, 3)
     coded = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
     Image.fromarray(np.rint(255 * coded).astype(np.uint8)).save(tmp_path / "a.png")
-    ended = done(image, tmp_path / "a.png", "--endmembers", 2, "--output", tmp_path)
+    ended = done(image, tmp_path / "a.png", "--endmembers", 2, "--output-dir", tmp_path)
     assert "the picture is taken as sRGB and brought to linear light" in ended.out
     misfit = open_spectral_file(tmp_path / "a" / "confidence.hdr").read()[..., 1]
     assert misfit.mean() < 0.01

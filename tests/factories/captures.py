@@ -85,7 +85,7 @@ def process(capture: Path, output: Path, layout: str = "cubes", tell: Tell = lam
     """Make the scene of a capture, of the layout `cubes` with all of each image unless a mask is asked for; gives what
     looks wrong."""
     given = {"poses": "transforms.json", "mask": "none"} if layout == "cubes" else {}
-    asked = ProcessOptions(layout, data=capture, output=output, **{**given, **options})
+    asked = ProcessOptions(layout, data=capture, output_dir=output, **{**given, **options})
     return process_capture(asked, tell, lambda _, views: views)
 
 

@@ -141,7 +141,7 @@ class WrittenScene:
 
 def processed(*words: object, output: Path) -> WrittenScene:
     """The scene that `unmix-process` with these words writes to a folder."""
-    ended = done(process, *words, "--output", output)
+    ended = done(process, *words, "--output-dir", output)
     content = json.loads((output / "transforms.json").read_text(encoding="utf-8"))
     turned = np.array(content.get("applied_transform", np.eye(4)[:3].tolist()))
     views = []
@@ -159,7 +159,7 @@ def processed(*words: object, output: Path) -> WrittenScene:
 
 def not_processed(*words: object, output: Path) -> str:
     """What is said where `unmix-process` has to refuse these words; nothing may be left of a scene."""
-    message = refused(process, *words, "--output", output)
+    message = refused(process, *words, "--output-dir", output)
     assert not output.exists()
     return message
 

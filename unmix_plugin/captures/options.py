@@ -15,6 +15,7 @@ from unmix_plugin.captures.cube import Axes, Capture, ReadOptions
 from unmix_plugin.captures.poses.estimation import require_pycolmap
 from unmix_plugin.captures.poses.marker_detection import parse_family, require_opencv
 from unmix_plugin.captures.poses.turntable_observations import parse_angles
+from unmix_plugin.engine.configs import short_flag
 from unmix_plugin.errors import CaptureError, ConfigError, did_you_mean
 
 _LAYOUTS = {
@@ -51,7 +52,7 @@ class ProcessOptions:
     """How the files of the capture are laid out."""
     data: Path
     """Folder of the capture."""
-    output: Path
+    output_dir: Annotated[Path, short_flag("output")]
     """Folder to write the scene to; it appears when the scene is complete."""
     poses: str | None = None
     """Where the cameras were: a file or folder of another program (transforms.json, COLMAP, Metashape, ...); or found

@@ -69,8 +69,8 @@ def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list
     """
     # Load: what the options name, and which files are views.
     check_options(options)
-    refuse_output(options.output, options.overwrite)
-    folder = WorkFolder(options.output)
+    refuse_output(options.output_dir, options.overwrite)
+    folder = WorkFolder(options.output_dir)
     folder.refuse_foreign()
     require_apart((folder.output, folder.path), _paths_read(options))
     references = _open_references(options)

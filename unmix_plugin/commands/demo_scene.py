@@ -131,7 +131,7 @@ def _write_capture(options: _DemoSceneOptions) -> None:
         ("truth", "true materials of each pixel and their reflectances, the lamp's spectrum"),
     ):
         tell(f"  {folder / name}  {content}")
-    words = ["unmix-process", "cubes", "--data", folder, "--output", "SCENE"]
+    words = ["unmix-process", "cubes", "--data", folder, "--output-dir", "SCENE"]
     words += ["--white", folder / "white.hdr", "--dark", folder / "dark.hdr", "--poses"]
     marked = ["markers", "--marker-size", MARKER_SIZE, "--marker-family", MARKER_FAMILY]
     tell(f"make a scene of it: {shell_line(*words, *(marked if options.markers else ['estimate']))}")
@@ -177,7 +177,7 @@ def _write_scans(options: _DemoSceneOptions) -> None:
         ("truth", "true materials of each pixel and their reflectances, the lamp's spectrum"),
     ):
         tell(f"  {folder / name}  {content}")
-    words = ["unmix-process", "lines", "--data", folder, "--output", "SCENE"]
+    words = ["unmix-process", "lines", "--data", folder, "--output-dir", "SCENE"]
     words += ["--white", folder / "white.hdr", "--dark", folder / "dark.hdr"]
     words += ["--poses", folder / STAGES, "--field-of-view", f"{FIELD_OF_VIEW_DEG:g}"]
     tell(f"make a scene of it: {shell_line(*words)}")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from unmix_plugin.commands.process_inspect import ReadingOptions
+from unmix_plugin.engine.configs import short_flag
 from unmix_plugin.engine.printing import tell
 from unmix_plugin.errors import CaptureError, ConfigError, counted
 
@@ -50,7 +51,7 @@ class _ImageOptions(ReadingOptions):
     ECOSTRESS or USGS, or folders of them; +builtin for the built-in ones."""
     mnf: int = 0
     """How many minimum noise fractions of the image to write: components in order of their noise."""
-    output: Path = Path("unmixed")
+    output_dir: Annotated[Path, short_flag("output")] = Path("unmixed")
     """Results go to a folder in it, named like the file."""
     overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Replace earlier results."""
@@ -69,7 +70,7 @@ def image(argv: list[str]) -> None:
     from unmix_plugin.products.unmixed_image import unmixed_image_paths, write_unmixed_image
     from unmix_plugin.spectral.unmixing.image import unmix_image
 
-    folder = options.output / safe_name(options.file.resolve().stem, NOT_PORTABLE, "image")
+    folder = options.output_dir / safe_name(options.file.resolve().stem, NOT_PORTABLE, "image")
     paths = unmixed_image_paths(folder, bool(options.library), options.mnf > 0)
     all_paths = unmixed_image_paths(folder, True, True)
     refuse_to_overwrite(all_paths, options.overwrite)

@@ -1,4 +1,4 @@
-"""`unmix-process LAYOUT --data PATH --output DIR`: from what an instrument wrote to a scene to train on.
+"""`unmix-process LAYOUT --data PATH --output-dir DIR`: from what an instrument wrote to a scene to train on.
 
 `unmix-process inspect FILE...` says what files hold.
 """
@@ -30,4 +30,4 @@ def process(arguments: list[str]) -> None:
     console = CommandConsole()
     for finding in process_capture(options, partial(say, console), partial(follow, console)):
         tell(f"looks wrong: {finding}")
-    tell(f"scene: {options.output}")
+    tell(f"scene: {options.output_dir}")

@@ -188,7 +188,7 @@ def together(cubes: dict[str, np.ndarray], facts: dict[str, dict]):
     """The sensors of files that one camera wrote, as they are brought to one exposure."""
     bands = np.array([500.0, 600.0, 700.0])
     files = {name: file_of(cube, bands, **facts[name]) for name, cube in cubes.items()}
-    options = ProcessOptions("cubes", data=Path(), output=Path())
+    options = ProcessOptions("cubes", data=Path(), output_dir=Path())
     each = {name: [CaptureView(name, file, name)] for name, file in files.items()}
     sensors = {name: plan_sensor(own, options, GivenReferences(), own) for name, own in each.items()}
     return with_one_exposure(sensors, files).values()

@@ -233,7 +233,7 @@ def folder(tmp_path_factory):
 def test_a_scene_of_marked_pictures_has_their_poses_in_metres(folder, tmp_path):
     data, truth = folder
     words = ["cubes", "--data", data, "--wavelengths", "610,550,465", "--mask", "white"]
-    words += ["--output", tmp_path / "scene", "--poses", "markers", "--marker-size", SIDE]
+    words += ["--output-dir", tmp_path / "scene", "--poses", "markers", "--marker-size", SIDE]
     done(process, *words)
     found = read_poses(tmp_path / "scene" / "transforms.json")
     names = {name: name.split("/")[-1].removesuffix(".png") for name in found.cameras}
@@ -255,6 +255,6 @@ def test_a_scene_of_marked_pictures_has_their_poses_in_metres(folder, tmp_path):
     ],
 )
 def test_what_does_not_fit_is_refused_before_anything_is_written(folder, tmp_path, words, said):
-    asked = ["cubes", "--data", folder[0], "--wavelengths", "610,550,465", "--output", tmp_path / "scene"]
+    asked = ["cubes", "--data", folder[0], "--wavelengths", "610,550,465", "--output-dir", tmp_path / "scene"]
     assert said in refused(process, *asked, *words.split())
     assert list(tmp_path.iterdir()) == []

@@ -141,13 +141,13 @@ def refuse_output(output: Path, overwrite: bool) -> None:
     """Look before anything is computed whether the scene can get its name. Raises ConfigError: the folder holds
     something; with `overwrite`, something that this command did not make."""
     if not output.resolve().name:
-        raise ConfigError(f"{output} can't be a scene; give a folder of its own with --output")
+        raise ConfigError(f"{output} can't be a scene; give a folder of its own with --output-dir")
     if output.is_file():
-        raise ConfigError(f"{output} is a file; give a folder with --output")
+        raise ConfigError(f"{output} is a file; give a folder with --output-dir")
     if not output.is_dir() or not any(output.iterdir()):
         return
     if not (output / RECORD_NAME).is_file():
-        raise ConfigError(f"{output} is not empty; give a new folder with --output")
+        raise ConfigError(f"{output} is not empty; give a new folder with --output-dir")
     if not overwrite:
         raise ConfigError(f"{output} holds a scene already; replace it with --overwrite, or choose another")
     refuse_folder(output.resolve())
@@ -161,7 +161,7 @@ def fingerprint(plan: Plan, options: ProcessOptions) -> dict[str, Any]:
     """What must be the same for views to be used again: options, decisions and input files. Raises CaptureError: a
     file can't be read."""
     free = [
-        "output",
+        "output_dir",
         "overwrite",
         "poses",
         "marker_size",
