@@ -6,6 +6,7 @@ Notation: `C` cells.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -36,10 +37,15 @@ class UnexplainedMap:
     values: Float32[np.ndarray, " C"]
     """u, [0, 1]."""
 
+    @cached_property
+    def _by_key(self) -> tuple[Int64[Tensor, " C"], Float32[Tensor, " C"]]:
+        """Keys of the cells in their order, and their values: sorted once for all views."""
+        known, order = CellGrid.keys_of(torch.from_numpy(self.cells)).sort()
+        return known, torch.from_numpy(self.values)[order]
+
     def at(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
         """u at points of model space: the mean of their cell and the 26 around it that are known, NaN without any."""
-        known, order = CellGrid.keys_of(torch.from_numpy(self.cells)).sort()
-        values = torch.from_numpy(self.values)[order]
+        known, values = self._by_key
         keys = CellGrid(torch.from_numpy(self.origin), self.edge).keys(points.detach().cpu())
         total, count = torch.zeros(keys.shape), torch.zeros(keys.shape)
         for step in NEIGHBOURS:
