@@ -130,9 +130,9 @@ def light_near_cameras(
 
     What is as well explained by something farther away, as a plain sky is, does not hang in the air between cameras.
     """
-    views = rays.camera_indices
-    firsts = torch.searchsorted(views.sort().values, views.unique())
-    cameras = rays.origins.detach()[views.argsort(stable=True)[firsts]]
+    views, order = rays.camera_indices.sort(stable=True)
+    is_first = views.diff(prepend=views[:1] - 1) != 0
+    cameras = rays.origins.detach()[order[is_first]]
     cameras = cameras[:: -(-len(cameras) // _MOST_CAMERAS)]
     reach = _NEAR_REACH * (cameras - space.box.aabb.mean(dim=0)).norm(dim=-1).median()
     nearest = torch.cdist(space.from_unit(positions), cameras).amin(dim=1)
