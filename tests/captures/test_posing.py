@@ -89,9 +89,12 @@ def test_what_was_placed_returns_to_the_source_also_when_it_was_written(tmp_path
 def test_a_scene_with_a_placement_has_the_sources_world(tmp_path, offset):
     folder = make_scene(tmp_path / "scene")
     plain = load_scene(folder.root)
-    folder.edit(lambda content: content.update({**SIMILARITY.to_json(), "offset": offset.tolist()}))
+    marked = {"markers": {"7": [[1.0, 2.0, 3.0]]}}
+    folder.edit(lambda content: content.update({**SIMILARITY.to_json(), "offset": offset.tolist(), **marked}))
     scene = load_scene(folder.root)
     np.testing.assert_allclose(scene.cameras.camera_to_world, plain.cameras.camera_to_world)
+    marker = SIMILARITY.to_source(np.array([[1.0, 2.0, 3.0]])) + offset
+    np.testing.assert_allclose(scene.markers["7"], marker, rtol=0, atol=1e-8)
     corners = scene.scene_box.aabb.double().numpy()
     expected = SIMILARITY.to_source(plain.normalisation.to_world(corners)) + offset
     np.testing.assert_allclose(scene.normalisation.to_world(corners), expected, rtol=0, atol=1e-8)

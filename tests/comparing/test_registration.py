@@ -69,6 +69,47 @@ def test_other_objects_and_other_materials_are_refused(surface):
         register(surface, in_world(repainted, MOVED), PIXEL)
 
 
+MARKS = {
+    str(index): np.array([0.3 * index - 1.0, (-1.0) ** index, -1.2]) + 0.1 * np.array(
+        [[0, 1, 0], [1, 1, 0], [1, 0, 0], [0, 0, 0]], float
+    )
+    for index in range(6)
+}  # fmt: skip
+"""Corners of printed markers around the object."""
+MARKS_LATER = {name: MOVED.apply(corners) for name, corners in MARKS.items()}
+
+
+def test_markers_hold_a_plain_ball_that_surfaces_alone_do_not():
+    ball = surface_of_shape(lambda directions: np.ones(len(directions)), spectra=np.full((2562, 4), 0.5))
+    moved = in_world(ball, MOVED)
+    found = register(ball, moved, PIXEL, markers=(MARKS, MARKS_LATER))
+    assert rms_px(found.to_before, MOVED.inverse, moved.positions) < 0.3
+    assert found.markers_px is not None
+    assert found.markers_px < 0.3
+    assert rms_px(register(ball, moved, PIXEL).to_before, MOVED.inverse, moved.positions) > 3.0
+
+
+def test_a_marker_that_moved_is_left_out_and_said(surface):
+    later = MARKS_LATER | {"2": MARKS_LATER["2"] + 10 * PIXEL}
+    found = register(surface, in_world(surface, MOVED), PIXEL, markers=(MARKS, later))
+    assert rms_px(found.to_before, MOVED.inverse, in_world(surface, MOVED).positions) < 0.2
+    assert found.notes == ("markers that moved against the others are not used: 2",)
+
+
+def test_markers_that_contradict_the_surface_do_not_decide_and_that_is_said(surface):
+    moved = in_world(surface, MOVED)
+    for later in (
+        {name: corners + np.array([0.0, 8 * PIXEL, 0.0]) for name, corners in MARKS_LATER.items()},
+        {name: 3.0 * corners[:, [1, 0, 2]] * [1, -1, 1] for name, corners in MARKS_LATER.items()},
+    ):
+        found = register(surface, moved, PIXEL, markers=(MARKS, later))
+        assert rms_px(found.to_before, MOVED.inverse, moved.positions) < 0.2
+        assert found.markers_px is None
+        assert "contradict the surface" in found.notes[0]
+    in_a_line = {name: corners[:1] * [1.0, 0.0, 0.0] for name, corners in MARKS.items()}
+    assert register(surface, moved, PIXEL, markers=(in_a_line, in_a_line)).notes == ()
+
+
 def test_the_way_back_undoes_a_similarity():
     points = np.random.default_rng(0).normal(size=(20, 3))
     np.testing.assert_allclose(MOVED.inverse.apply(MOVED.apply(points)), points, atol=1e-12)

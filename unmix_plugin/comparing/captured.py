@@ -78,6 +78,8 @@ class Capture:
     scale: Scale | None
     regions: Mapping[str, Region] = field(default_factory=dict)
     """Kept with the run, by name."""
+    markers: Mapping[str, Float64[np.ndarray, "n 3"]] = field(default_factory=dict)
+    """World points of what was marked, by name, as the scene has them."""
 
     @property
     def bands(self) -> Bands:
@@ -250,7 +252,9 @@ def open_capture(path: str | Path, data: str | Path | None = None, device: str =
             f"{summary.get('root')}; say where it is now"
         )
     measured = MeasuredScene(scene, summary.get("illuminant"))
-    found = Capture(run.scene_name, run.folder.path, trained, measured, run.scale, run.measures.regions)
+    found = Capture(
+        run.scene_name, run.folder.path, trained, measured, run.scale, run.measures.regions, scene.markers
+    )
     if len(found.usable_views) < LEAST_VIEWS:
         raise ConfigError(
             f"{path} has {len(found.usable_views)} views with all bands; a change is told from noise by at least "

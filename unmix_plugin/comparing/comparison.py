@@ -152,7 +152,8 @@ def compare(
         found = capture.surface(follow, working)
         surfaces.append(found if matrix is None else replace(found, spectra=found.spectra @ matrix))
     with working("laying the second surface on the first"):
-        registration = register(surfaces[0], surfaces[1], before.pixel, choice, ratio)
+        markers = (before.markers, after.markers)
+        registration = register(surfaces[0], surfaces[1], before.pixel, choice, ratio, markers)
     surface = surfaces[0]
     back = registration.to_before.inverse
     seen = [
@@ -168,7 +169,7 @@ def compare(
     unseen = 1 - float(surface.areas[found.known].sum() / surface.areas.sum())
     if unseen > _MUCH_UNSEEN:
         notes += (f"{unseen:.0%} of the first surface is not seen by enough views of both captures",)
-    return replace(found, notes=(*notes, *scale_notes, *found.notes))
+    return replace(found, notes=(*notes, *scale_notes, *registration.notes, *found.notes))
 
 
 _MUCH_UNSEEN = 0.3

@@ -112,6 +112,7 @@ def summary(comparison: Comparison) -> dict[str, Any]:
             "rms_px": found.rms_px,
             "overlap": found.overlap,
             "agreement": found.agreement,
+            "markers_px": found.markers_px,
             "scale": similarity.scale,
             "rotation": similarity.rotation.tolist(),
             "translation": similarity.translation.tolist(),

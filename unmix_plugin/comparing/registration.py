@@ -1,18 +1,21 @@
 """Where the second capture of an object lies in the world of the first: by its surface and by what that is made of.
 
-No markers. Coarse: turns spread over all rotations, with the centres and sizes of both surfaces put on each other,
+Coarse: turns spread over all rotations, with the centres and sizes of both surfaces put on each other,
 scored by how near points of one colour are; the worlds as they are is one more guess. Fine: iterated closest points,
 where a point is pulled to the plane of its partner and, along the surface, to where the spectrum is its own. Points
 without a near partner of about the same normal don't count, so that what changed or is seen once only pulls nothing.
+No markers are needed. Where both captures have some they give the first guess, pull a little so that a surface that is
+round or plain does not slide, and say at the end whether they agree; where they don't, the surface decides.
 
 Source: iterated closest points (Besl and McKay 1992) point to plane (Chen and Medioni 1992), with colour as Park, Zhou
 and Koltun 2017 (coloured point cloud registration) have it, here for a few principal axes of spectra; weights of Tukey.
 
-Notation: `P`, `Q` points of the moving and of the fixed surface, `C` axes of spectra, `B` bands.
+Notation: `P`, `Q` points of the moving and of the fixed surface, `C` axes of spectra, `B` bands, `M` points of markers.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
@@ -23,7 +26,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from unmix_plugin.comparing.captured import Surface
-from unmix_plugin.errors import ConfigError
+from unmix_plugin.errors import ConfigError, name_some
 
 ScaleChoice = Literal["free", "fixed", "auto"]
 """Whether a unit of the second world may have any length in the first's."""
@@ -41,6 +44,13 @@ _ALIKE = 0.15
 """Difference of unit spectra, light taken out, below which places are of one material; about radians."""
 _LEAST_OVERLAP, _LEAST_AGREEMENT, _LARGEST_RMS_PX = 0.35, 0.6, 1.5
 _NEIGHBOURS = 12
+_MARKER_WEIGHT = 0.05
+"""What all markers together count, of what the surface does."""
+_LEAST_ACROSS = 0.05
+"""Extent of markers across the line that fits them best, over that along it, from which they tell a turn."""
+
+Markers = Mapping[str, Float64[np.ndarray, "n 3"]]
+"""World points by name."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,18 +95,30 @@ class Registration:
     """Part of that where the spectra are alike, light taken out."""
     light: Float64[np.ndarray, " B"]
     """The second capture's radiance over the first's, of places that did not change; one number for each band."""
+    markers_px: float | None = None
+    """Root mean square distance between the markers of both that were used, pixels; None without any."""
+    notes: tuple[str, ...] = ()
+    """Which markers were not used, and why."""
 
     def in_words(self) -> str:
         """How well they fit, for people."""
+        markers = (
+            "" if self.markers_px is None else f"; markers of both are {self.markers_px:.2f} pixels apart"
+        )
         return (
             f"registered: rms {self.rms_px:.2f} pixels where both surfaces are, which is {self.overlap:.0%} of the "
             f"first; {self.agreement:.0%} of that has the same spectra; 1 unit of the second world is "
-            f"{self.to_before.scale:.5g} of the first"
+            f"{self.to_before.scale:.5g} of the first{markers}"
         )
 
 
 def register(
-    before: Surface, after: Surface, pixel: float, scale: ScaleChoice = "free", ratio: float | None = None
+    before: Surface,
+    after: Surface,
+    pixel: float,
+    scale: ScaleChoice = "free",
+    ratio: float | None = None,
+    markers: tuple[Markers, Markers] = ({}, {}),
 ) -> Registration:
     """Lay the second surface onto the first; both have the same bands.
 
@@ -104,22 +126,102 @@ def register(
         pixel: Edge of a pixel, units of the first world.
         scale: `fixed` takes `ratio` for how long a unit of the second world is in the first.
         ratio: None: worlds of unknown size, which have to be of the same size where the scale is fixed.
+        markers: Of each capture, in its world; those of one name and as many points are the same ones.
     Raises:
         ConfigError: the surfaces don't fit each other.
     """
     fixed_ratio = (1.0 if ratio is None else ratio) if scale == "fixed" else None
-    light = _mean(after) / _mean(before).clip(min=1e-9)
-    clouds = _clouds(before, after, light, pixel)
-    found = _best_start(*clouds, fixed_ratio)
+    marked = _common_markers(markers, pixel, fixed_ratio)
+    notes: tuple[str, ...] = ()
+    if marked is not None:
+        try:
+            found = _laid(before, after, pixel, fixed_ratio, marked)
+            if found.markers_px is not None and found.markers_px <= _NEAR_PX:
+                return replace(found, notes=marked.notes)
+            apart = f"they are {found.markers_px:.3g} pixels apart where the surfaces lie on each other"
+        except ConfigError:
+            apart = "the surfaces don't lie on each other where they do"
+        contradiction = (
+            f"the markers of both captures ({name_some(marked.names)}) contradict the surface: {apart}. The surface "
+            "decides; were they moved, or are others of the same numbers?"
+        )
+        notes = (contradiction,)
+    return replace(_laid(before, after, pixel, fixed_ratio, None), notes=notes)
+
+
+@dataclass(frozen=True, eq=False)
+class _CommonMarkers:
+    """Points of markers that keep their places, in pixels of the first capture, each in its world."""
+
+    names: tuple[str, ...]
+    fixed: Float64[np.ndarray, "M 3"]
+    moving: Float64[np.ndarray, "M 3"]
+    way: Similarity
+    """From the second to the first."""
+    notes: tuple[str, ...]
+    """Which ones moved."""
+
+
+def _common_markers(
+    markers: tuple[Markers, Markers], pixel: float, ratio: float | None
+) -> _CommonMarkers | None:
+    """Markers of both captures, without those that most others contradict; None where they tell no turn."""
+    both = [
+        name
+        for name, points in markers[0].items()
+        if name in markers[1] and markers[1][name].shape == points.shape
+    ]
+    moved: list[str] = []
+
+    def points_of(names: list[str]) -> list[Float64[np.ndarray, "M 3"]]:
+        return [np.concatenate([np.zeros((0, 3)), *(one[name] for name in names)]) / pixel for one in markers]
+
+    def tell_turn(names: list[str]) -> bool:
+        extents = [
+            np.linalg.svd(points - points.mean(axis=0), compute_uv=False) for points in points_of(names)
+        ]
+        return all(bool(one[1] > _LEAST_ACROSS * one[0]) for one in extents)
+
+    if sum(len(markers[0][name]) for name in both) < 3 or not tell_turn(both):
+        return None
+    while True:
+        fixed, moving = points_of(both)
+        way = _similarity_between(moving, fixed, ratio)
+        misses = np.linalg.norm(way.apply(moving) - fixed, axis=1)
+        owners = np.repeat(both, [len(markers[0][name]) for name in both])
+        rest = [name for name in both if name != owners[misses.argmax()]]
+        if misses.max() <= _NEAR_PX or len(moved) + 1 >= len(rest) or not tell_turn(rest):
+            notes = (f"markers that moved against the others are not used: {name_some(moved)}",)
+            return _CommonMarkers(tuple(both), fixed, moving, way, notes if moved else ())
+        moved += [name for name in both if name not in rest]
+        both = rest
+
+
+def _similarity_between(
+    points: Float64[np.ndarray, "M 3"], targets: Float64[np.ndarray, "M 3"], ratio: float | None
+) -> Similarity:
+    """The similarity with the least squares from points to targets; its scale is `ratio` where that is given."""
+    middle, goal = points.mean(axis=0), targets.mean(axis=0)
+    turn = Rotation.align_vectors(targets - goal, points - middle)[0]
+    turned = turn.apply(points - middle)
+    scale = float((turned * (targets - goal)).sum() / (turned**2).sum()) if ratio is None else ratio
+    return Similarity(scale, turn.as_matrix(), goal - scale * turn.apply(middle))
+
+
+def _laid(
+    before: Surface, after: Surface, pixel: float, ratio: float | None, marked: _CommonMarkers | None
+) -> Registration:
+    """Coarse, fine, and judged; from where markers are if there are some."""
+    light = (after.areas @ after.spectra / after.areas.sum()) / (
+        before.areas @ before.spectra / before.areas.sum()
+    ).clip(min=1e-9)
+    clouds = _clouds(before, after, light, pixel, marked)
+    found = _best_start(*clouds, ratio) if marked is None else marked.way
     for _ in range(2):
-        found = _refine(*clouds, found, fixed_ratio is None, _STEPS)
+        found = _refine(*clouds, found, ratio is None, _STEPS)
         light = _light(before, after, found, pixel, light)
-        clouds = _clouds(before, after, light, pixel)
+        clouds = _clouds(before, after, light, pixel, marked)
     return _judged(*clouds, found, light)
-
-
-def _mean(surface: Surface) -> Float64[np.ndarray, " B"]:
-    return surface.areas @ surface.spectra / surface.areas.sum()
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,6 +232,8 @@ class _Cloud:
     normals: Float64[np.ndarray, "P 3"]
     colours: Float64[np.ndarray, "P C"]
     areas: Float64[np.ndarray, " P"]
+    markers: Float64[np.ndarray, "M 3"]
+    """Row by row those of the other cloud."""
     pixel: float
 
     def some(self, most: int, seed: int = 0) -> _Cloud:
@@ -166,7 +270,12 @@ class _Cloud:
 
     def moved(self, transform: Similarity) -> _Cloud:
         """In another world."""
-        return replace(self, positions=transform.apply(self.positions), normals=transform.turn(self.normals))
+        return replace(
+            self,
+            positions=transform.apply(self.positions),
+            normals=transform.turn(self.normals),
+            markers=transform.apply(self.markers),
+        )
 
     @cached_property
     def tree(self) -> KDTree:
@@ -193,7 +302,11 @@ def unit(spectra: Float[np.ndarray, "*places B"]) -> Float[np.ndarray, "*places 
 
 
 def _clouds(
-    before: Surface, after: Surface, light: Float64[np.ndarray, " B"], pixel: float
+    before: Surface,
+    after: Surface,
+    light: Float64[np.ndarray, " B"],
+    pixel: float,
+    marked: _CommonMarkers | None,
 ) -> tuple[_Cloud, _Cloud]:
     """The fixed and the moving points, colours on common axes and positions in pixels of the first world."""
     first, second = unit(before.spectra), unit(after.spectra / light.clip(min=1e-9))
@@ -201,9 +314,14 @@ def _clouds(
     middle = both.mean(axis=0)
     _, _, axes = np.linalg.svd((both - middle)[:: max(1, len(both) // 4000)], full_matrices=False)
     axes = axes[:_AXES].T
+    markers = (np.zeros((0, 3)),) * 2 if marked is None else (marked.fixed, marked.moving)
     return (
-        _Cloud(before.positions / pixel, before.normals, (first - middle) @ axes, before.areas, pixel),
-        _Cloud(after.positions / pixel, after.normals, (second - middle) @ axes, after.areas, pixel),
+        _Cloud(
+            before.positions / pixel, before.normals, (first - middle) @ axes, before.areas, markers[0], pixel
+        ),
+        _Cloud(
+            after.positions / pixel, after.normals, (second - middle) @ axes, after.areas, markers[1], pixel
+        ),
     )
 
 
@@ -282,6 +400,13 @@ def _step(
         system.append(_COLOUR_WEIGHT * rows(gradients[:, axis], arms))
         values.append(_COLOUR_WEIGHT * colours[:, axis])
         counts.append(_tukey(colours[:, axis], 4 * spread) * weights)
+    if len(placed.markers):
+        apart = (fixed.markers - placed.markers).ravel()
+        share = _MARKER_WEIGHT * max(weights.sum(), 1.0) / len(apart)
+        system.append(rows(np.tile(np.eye(3), (len(placed.markers), 1)),
+                           np.repeat((placed.markers - middle) / size, 3, axis=0)))  # fmt: skip
+        values.append(apart)
+        counts.append(np.full(len(apart), share))
     matrix, wanted, counted = np.concatenate(system), np.concatenate(values), np.concatenate(counts)
     # A little pull towards partners keeps plain surfaces from sliding where neither shape nor colour holds them.
     normal = matrix.T @ (counted[:, None] * matrix) + 1e-6 * max(counted.sum(), 1.0) * np.eye(matrix.shape[1])
@@ -357,4 +482,6 @@ def _judged(fixed: _Cloud, moving: _Cloud, found: Similarity, light: np.ndarray)
             f"second (needed: {_LEAST_OVERLAP:.0%}), of which {agreement:.0%} is of the same materials (needed: "
             f"{_LEAST_AGREEMENT:.0%}), at {rms:.2f} pixels rms; are they of one object, seen from the same sides?"
         )
-    return Registration(in_world, rms, overlap, agreement, light)
+    apart = np.linalg.norm(fixed.markers - placed.markers, axis=1)
+    markers_px = float(np.sqrt((apart**2).mean())) if len(apart) else None
+    return Registration(in_world, rms, overlap, agreement, light, markers_px)

@@ -47,6 +47,11 @@ _Metres = Annotated[
     float, Meta(ge=METRES_RANGE[0], le=METRES_RANGE[1], description="1e-9 to 1e9, such as 0.001 for mm")
 ]
 _Paths = Annotated[list[str], Meta(description="a list of file paths")]
+_Coordinate = Annotated[float, Meta(ge=-1e9, le=1e9)]
+_Markers = Annotated[
+    dict[str, Annotated[list[tuple[_Coordinate, _Coordinate, _Coordinate]], Meta(min_length=1)]],
+    Meta(description="a list of points x, y, z for each name"),
+]
 
 
 class LensKeys(msgspec.Struct, kw_only=True, frozen=True):
@@ -150,6 +155,8 @@ class SceneKeys(msgspec.Struct, kw_only=True, frozen=True):
     """Sparse points of structure from motion."""
     left_out: Any = None
     """Views that are no frames, as they are spoilt."""
+    markers: _Markers | None = None
+    """Corners of printed markers, or single points, by name, in the world of the poses as they are written."""
     calibrated_value_of_1: Any = None
     """What 1 stands for in the unit that was measured, where values were divided."""
     reflectance_of_1: (

@@ -8,7 +8,7 @@ that of transforms.json before its `applied_transform`, `applied_scale` and `off
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
@@ -111,6 +111,8 @@ class Scene:
     """Widths of the instrument's bands; None where they are unknown."""
     decisions: tuple[Decision, ...] = ()
     """What was concluded from the views when the scene was read."""
+    markers: Mapping[str, Float64[np.ndarray, "n 3"]] = field(default_factory=dict)
+    """World points of what was marked, by name: the corners of printed markers, or single points."""
 
     @property
     def has_backdrop(self) -> bool:

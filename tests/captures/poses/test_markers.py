@@ -18,6 +18,8 @@ from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.commands.process import process
 from unmix_plugin.errors import CaptureError, ConfigError
+from unmix_plugin.scenes.placement import Placement
+from unmix_plugin.scenes.reading.loader import load_scene
 
 cv2 = pytest.importorskip("cv2")
 SIDE = 0.05
@@ -130,6 +132,7 @@ def test_poses_lens_scale_and_up_follow_from_markers():
     assert aligned.names == tuple(truth.cameras)
     assert aligned.rms_px < 0.15
     assert aligned.similarity.scale == pytest.approx(1.0, abs=0.005)
+    assert_corners(found, aligned.similarity)
     lens = present(found.cameras["view_0"].lens)
     assert lens.focal_px[0] == pytest.approx(350.0, rel=0.01)
     assert lens.distortion[0] == pytest.approx(-0.12, abs=0.05)
@@ -205,6 +208,13 @@ def test_markers_of_two_sizes_and_boards_that_moved_are_refused(before, after, s
         solved(sightings)
 
 
+def assert_corners(found: PoseSet, to_truth: Placement) -> None:
+    """The corners of all markers are where they are."""
+    assert set(found.markers) == {str(number) for number in BOARD}
+    for number, corners in BOARD.items():
+        np.testing.assert_allclose(to_truth.to_scene(found.markers[str(number)]), corners, atol=0.02 * SIDE)
+
+
 def test_markers_give_scale_and_up_to_poses_that_have_none():
     truth = cameras()
     tilted = replace(elsewhere(truth), has_world=False)
@@ -213,6 +223,7 @@ def test_markers_give_scale_and_up_to_poses_that_have_none():
     assert aligned.similarity.scale == pytest.approx(1.0, abs=0.005)
     np.testing.assert_allclose(aligned.similarity.rotation[2], [0, 0, 1], atol=5e-3)
     assert found.has_world
+    assert_corners(found, aligned.similarity)
     with pytest.raises(CaptureError, match="none of them seen by two cameras that agree"):
         metric_poses(tilted, {"view_0": seen(truth)["view_0"]}, SIDE)
 
@@ -240,6 +251,7 @@ def test_a_scene_of_marked_pictures_has_their_poses_in_metres(folder, tmp_path):
     aligned = align_poses(found, truth, names)
     assert len(names) == 4
     assert aligned.rms_px < 0.3
+    assert len(load_scene(tmp_path / "scene").markers) == len(BOARD)
     assert aligned.similarity.scale == pytest.approx(1.0, abs=0.005)
 
 

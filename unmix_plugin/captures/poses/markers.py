@@ -363,6 +363,10 @@ def _pose_set(
         up=up,
         has_world=marker_size is not None,
         metres_per_unit=None if marker_size is None else 1.0,
+        markers={
+            str(seen.numbers[marker]): to_board.to_scene(square)
+            for marker, square in zip(markers, corners, strict=True)
+        },
         notes=tuple(notes),
     )
 
@@ -408,16 +412,17 @@ def metric_poses(poses: PoseSet, sightings: Sightings, marker_size: float) -> Po
         if camera is not None and camera.lens is not None:
             for number, pixels in markers.items():
                 views_of.setdefault(number, []).append((camera, pixels))
-    located = [_located(those) for those in views_of.values() if len(those) > 1]
-    corners = [found for found in located if found is not None]
+    located = {str(number): _located(those) for number, those in views_of.items() if len(those) > 1}
+    corners = {name: found for name, found in located.items() if found is not None}
     if not corners:
         raise CaptureError(
             f"--marker-size: {counted(len(views_of), 'marker')} in the views, none of them seen by two cameras that "
             "agree; take the same one, sharp, into more pictures, or leave --marker-size out"
         )
-    way, up, how_up = _stand_on_markers(np.stack(corners), marker_size)
+    way, up, how_up = _stand_on_markers(np.stack(list(corners.values())), marker_size)
     notes = (*poses.notes, how_up, _how_large(marker_size))
-    return replace(poses.moved(way), up=up, has_world=True, metres_per_unit=1.0, notes=notes)
+    marked = replace(poses, markers=corners).moved(way)
+    return replace(marked, up=up, has_world=True, metres_per_unit=1.0, notes=notes)
 
 
 def _located(

@@ -116,16 +116,19 @@ class PoseSet:
     """Whether the coordinates mean something to the user. Those of estimated poses don't."""
     metres_per_unit: float | None = None
     """Metres in a unit of the source, where that is known: printed markers, geo-referenced coordinates."""
+    markers: Mapping[str, Float64[np.ndarray, "4 3"]] = field(default_factory=dict)
+    """Corners of printed markers by their number, as cameras see them."""
     notes: tuple[str, ...] = ()
     """What was changed or is odd: rotations made rigid, frames without files, ..."""
     warnings: tuple[str, ...] = ()
     """What may make the geometry wrong, one sentence each: reports begin with it."""
 
     def moved(self, placement: Placement) -> PoseSet:
-        """Cameras and points in the world that a similarity leads to."""
+        """Cameras, points and markers in the world that a similarity leads to."""
         cameras = {name: camera.moved(placement) for name, camera in self.cameras.items()}
         points = None if self.points is None else placement.to_scene(self.points)
-        return replace(self, cameras=cameras, points=points)
+        markers = {name: placement.to_scene(corners) for name, corners in self.markers.items()}
+        return replace(self, cameras=cameras, points=points, markers=markers)
 
 
 def angles_between_axes(cameras: Sequence[PosedCamera]) -> Float64[np.ndarray, "N N"]:

@@ -158,6 +158,8 @@ def write_scene_files(
         for name, reason in named.items()
     ]
     keys |= {"left_out": others} if others else {}
+    markers = {name: corners.tolist() for name, corners in posed.poses.markers.items()}
+    keys |= {"markers": markers} if markers else {}
     write_file(folder / _SCENE_NAME, transforms_bytes(_transforms_json(plan, posed.views, seen, keys)))
     return findings
 

@@ -198,6 +198,10 @@ def _assemble(
         input_hashes=hashes(inputs),
         truth_hashes=hashes(truths),
         options=options,
+        markers={
+            name: entry.placement.to_source(np.array(points))
+            for name, points in (entry.keys.markers or {}).items()
+        },
     )
 
 
