@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import fast_simplification
 import numpy as np
 import torch
 from jaxtyping import Float64
@@ -46,7 +47,6 @@ from unmix_plugin.settings import UnmixModelConfig
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 from unmix_plugin.trained.camera_files import camera_entry
-from unmix_plugin.trained.decimation import decimated
 from unmix_plugin.trained.open_run import LoadedRun, find_scene, load_run
 from unmix_plugin.trained.run_views import positions_for_files
 from unmix_plugin.trained.surface_mesh import surface_of
@@ -241,20 +241,23 @@ def _write_mesh(folder: Path, recipe: ObjectRecipe, loaded: LoadedRun, say: Say)
     """The surface of the run in the scene's world."""
     say("looking for its surface ...")
     whole, unseen = surface_of(loaded.materials_scene, keeps_unseen=True)
-    mesh = decimated(whole, recipe.num_triangles)
-    vertices = positions_for_files(loaded.scene.frame.to_world(mesh.vertices))
+    vertices, faces = whole.vertices.astype(np.float64), whole.faces
+    if len(faces) > recipe.num_triangles:
+        found = fast_simplification.simplify(vertices, faces, target_count=recipe.num_triangles)
+        vertices, faces = found[:2]
+    vertices = positions_for_files(loaded.scene.frame.to_world(vertices))
     columns = {name: vertices[:, axis] for axis, name in enumerate("xyz")}
-    write_ply(folder / "mesh.ply", columns, mesh.faces, ("surface of an unmix-nerf run",))
+    write_ply(folder / "mesh.ply", columns, faces, ("surface of an unmix-nerf run",))
     guess = (
         f"{unseen:.0%} of it no camera sees, which is closed by a guess: capture the object from there, too"
     )
     doubt = guess if unseen > _MOST_UNSEEN else "no part of it is unseen"
-    say(f"mesh of {len(mesh.faces):,} triangles; {doubt}")
+    say(f"mesh of {len(faces):,} triangles; {doubt}")
     return Decision(
         "mesh",
         "closed surface of the run",
         {
-            "triangles": len(mesh.faces),
+            "triangles": len(faces),
             "before it was decimated": len(whole.faces),
             "part that no camera sees": unseen,
         },
