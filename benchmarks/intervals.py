@@ -15,7 +15,7 @@ import json
 import tempfile
 import time
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
@@ -31,9 +31,12 @@ from scipy.stats import spearmanr
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.metrics import match_endmembers
 from unmix_plugin.trained.evaluation import scene_truth, view_truth
+from unmix_plugin.trained.measured_errors import measure_errors
 from unmix_plugin.trained.open_run import find_scene, load_run
 from unmix_plugin.trained.outputs import interval_ends
+from unmix_plugin.trained.places import MeasuredScene
 from unmix_plugin.trained.trained_scene import TrainedScene
+from unmix_plugin.trained.training_views import thinned_views
 
 COVERAGES = (0.5, 0.8, 0.9, 0.95)
 MEDIAN = (0.86, 0.94)
@@ -129,9 +132,12 @@ def measure(run: Path, device: str) -> tuple[str, dict[str, Any]]:
     scene, trained = find_scene(loaded.record.summary, run, None), loaded.materials_scene
     if scene is None or scene.endmembers is None:
         raise SystemExit(f"{run}: its scene is not where it was, or has no true endmembers")
+    views = list(thinned_views(trained, MeasuredScene(scene, loaded.record.summary.get("illuminant"))))
+    errors = measure_errors(trained, views)  # by this revision, as the end of a training does it
+    trained = replace(trained, measured_errors=errors or "too few views")
     _ = trained.require_errors()  # which says why there are none
-    views = [of_view(trained, scene, index) for index in scene.eval_indices]
-    joined = {key: np.concatenate([view[key] for view in views]) for key in views[0]}
+    counted = [of_view(trained, scene, index) for index in scene.eval_indices]
+    joined = {key: np.concatenate([view[key] for view in counted]) for key in counted[0]}
     return scene.root.name, {**scores(joined, scene), **times(trained), "training": training_share(run)}
 
 

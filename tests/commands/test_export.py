@@ -30,7 +30,7 @@ from unmix_plugin.settings import SceneOptions
 from unmix_plugin.trained.measured_errors import write_errors
 from unmix_plugin.trained.measures import keep_region
 from unmix_plugin.trained.open_run import load_run, open_run
-from unmix_plugin.trained.place_errors import PixelErrors, PlaceErrors
+from unmix_plugin.trained.place_errors import ComparedPixels, PlaceErrors
 from unmix_plugin.trained.regions import Box
 from unmix_plugin.trained.surface_mesh import TriangleMesh, vertex_areas
 
@@ -396,13 +396,15 @@ def test_numbers_stand_between_the_ends_of_their_intervals(solid_copy):
     low, high = scene.scene_box.aabb
     places = low + torch.rand(20_000, 3, generator=generator) * (high - low)
     size = (len(places), len(scene.materials.names))
-    abundances = 0.05 * torch.randn(size, generator=generator) + 0.02
-    spectra = 0.01 * torch.randn(len(places), len(scene.bands), generator=generator) + 0.01
+    abundances, spectra = torch.full(size, 1 / size[1]), torch.ones(len(places), len(scene.bands))
+    possible = abundances + 0.05 * torch.randn(size, generator=generator) + 0.02
+    measured = spectra + 0.01 * torch.randn(spectra.shape, generator=generator) + 0.01
     views = torch.randint(0, 5, (len(places),), generator=generator)
-    found = PixelErrors(places, views, spectra, (abundances,), (torch.ones(size),))
-    write_errors(
-        solid_copy, PlaceErrors.fit(found, low, 0.25 * float((high - low).max())), loaded.training.steps
+    compared = ComparedPixels(places, views, spectra, measured, abundances, possible[None])
+    errors = PlaceErrors.fit(
+        compared, 0.01 * scene.materials.endmembers.cpu(), low, 0.25 * float((high - low).max())
     )
+    write_errors(solid_copy, errors, loaded.training.steps)
 
     done(export, *words("regions", "--run", solid_copy))
     with (solid_copy / "exports/regions/regions.csv").open() as file:

@@ -19,7 +19,7 @@ from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.spectral.intervals import width_factor
 from unmix_plugin.trained.measured_errors import FILE_NAME, measure_errors, read_errors, write_errors
 from unmix_plugin.trained.measured_surface import MeasuredSurface
-from unmix_plugin.trained.place_errors import CELL_SIZES_PX, PixelErrors, PlaceErrors
+from unmix_plugin.trained.place_errors import CELL_SIZES_PX, ComparedPixels, PlaceErrors
 from unmix_plugin.trained.places import MeasuredScene, NamedRegion, spectrum_at
 from unmix_plugin.trained.regions import Box, OfMaterial
 from unmix_plugin.trained.run_views import RunView
@@ -46,20 +46,25 @@ def pixel_errors(positions, deviations, generator, common=0.0):
         own = own * (1 + 2 * (torch.rand(len(positions), 1, generator=generator) > 0.9))
         return deviations[:, None] * (own + common)
 
-    abundances = draw(3)
-    return PixelErrors(
-        positions,
-        torch.randint(0, VIEWS, (len(positions),), generator=generator),
-        draw(NUM_BANDS),
-        (abundances,),
-        (torch.ones_like(abundances),),
+    of_view = torch.randint(0, VIEWS, (len(positions),), generator=generator)
+    abundances, spectra = known(len(positions))
+    return ComparedPixels(
+        positions, of_view, spectra, spectra - draw(NUM_BANDS), abundances, (abundances - draw(3))[None]
     )
+
+
+def known(count):
+    """Abundances and spectra that are rendered everywhere."""
+    return torch.full((count, 3), 1 / 3), torch.ones(count, NUM_BANDS)
 
 
 def fitted(common=0.0, count=20_000, seed=0):
     generator = torch.Generator().manual_seed(seed)
     errors = PlaceErrors.fit(
-        pixel_errors(*places(count, generator), generator, common), torch.zeros(3), PIXEL
+        pixel_errors(*places(count, generator), generator, common),
+        torch.full((3, NUM_BANDS), 0.01),
+        torch.zeros(3),
+        PIXEL,
     )
     assert errors is not None
     return errors
@@ -69,13 +74,14 @@ def fitted(common=0.0, count=20_000, seed=0):
 def test_of_errors_that_were_not_seen_as_many_are_within_as_the_coverage_says(coverage):
     errors, generator = fitted(), torch.Generator().manual_seed(7)
     positions, deviations = places(5000, generator)
-    fresh, local = pixel_errors(positions, deviations, generator), errors.at(positions)
+    fresh, local = pixel_errors(positions, deviations, generator), errors.at(positions, *known(5000))
     is_large = deviations > 0.05
     half = width_factor(errors.abundance_factors, coverage) * local.abundances
     of_spectra = (
         width_factor(errors.spectrum_factors, coverage) * local.spectra[:, None] * errors.band_deviations
     )
-    for within in (fresh.abundances[0].abs() <= half, fresh.spectra.abs() <= of_spectra):
+    of_abundances, of_bands = fresh.abundances - fresh.possible[0], fresh.rendered - fresh.measured
+    for within in (of_abundances.abs() <= half, of_bands.abs() <= of_spectra):
         for part in (is_large, ~is_large):
             assert float(within[part].double().mean()) == pytest.approx(coverage, abs=0.03)
     assert float(half[is_large].mean() / half[~is_large].mean()) == pytest.approx(4, rel=0.15)
@@ -86,9 +92,10 @@ def test_what_is_the_same_everywhere_stays_in_the_mean_of_a_region_and_the_rest_
     positions, _ = places(500, generator)
     weights = np.ones(500)
     edge = 48 * PIXEL
-    own = fitted(0.0).over_region(positions, weights, edge)
-    shared = fitted(2.0).over_region(positions, weights, edge)
-    alone = fitted(2.0).at(positions)
+    independent, alike = fitted(0.0), fitted(2.0)
+    own = independent.over_region(independent.at(positions, *known(500)), weights, edge)
+    alone = alike.at(positions, *known(500))
+    shared = alike.over_region(alone, weights, edge)
     assert float(own.abundances.max()) < 0.2 * float(alone.abundances.mean())
     assert float(shared.abundances.min()) > 0.6 * float(alone.abundances.square().mean().sqrt())
 
@@ -98,10 +105,10 @@ def test_where_fewer_than_two_views_measured_errors_are_unknown():
     away = torch.tensor(
         [[30 * PIXEL, 30 * PIXEL, 0.0], [30 * PIXEL, 30 * PIXEL, 5 * CELL_SIZES_PX[0] * PIXEL]]
     )
-    local = errors.at(away)
+    local = errors.at(away, *known(2))
     assert local.spectra.isfinite().tolist() == [True, False]
     assert local.abundances.isfinite().all(dim=1).tolist() == [True, False]
-    nowhere = errors.over_region(away[1:], np.ones(1), PIXEL)
+    nowhere = errors.over_region(errors.at(away[1:], *known(1)), np.ones(1), PIXEL)
     assert nowhere.spectra.isnan().all()
 
 
@@ -109,7 +116,7 @@ def test_of_two_views_nothing_is_said():
     generator = torch.Generator().manual_seed(0)
     found = pixel_errors(*places(2000, generator), generator)
     few = replace(found, views=found.views % 2)
-    assert PlaceErrors.fit(few, torch.zeros(3), PIXEL) is None
+    assert PlaceErrors.fit(few, torch.zeros(3, NUM_BANDS), torch.zeros(3), PIXEL) is None
 
 
 def test_a_run_keeps_its_errors_and_says_why_there_are_none(tmp_path):
@@ -183,8 +190,11 @@ def test_the_interval_of_an_index_follows_from_that_of_spectra(measured):
     probe = measured.probe(*middle(measured))
     index, band = measured.interval(probe, "index:r500"), measured.interval(probe, "band:500nm")
     assert index.low == pytest.approx(probe.values["predicted"][1] - index.width / 2)
-    assert index.high == pytest.approx(band.high, rel=1e-3)
-    assert band.low == max(index.low, 0)
+    assert index.width == pytest.approx(2 * (band.high - probe.values["predicted"][1]), rel=0.5)
+    brighter = replace(probe, values={name: 1.2 * one for name, one in probe.values.items()})
+    ratio, of_brighter = (measured.interval(one, "index:r500/r600") for one in (probe, brighter))
+    assert of_brighter.low + of_brighter.high == pytest.approx(ratio.low + ratio.high)
+    assert of_brighter.width < ratio.width  # errors that only make a spectrum brighter don't change it
     ratio = measured.interval(probe, "index:r500/r500")
     assert (ratio.low, ratio.high) == pytest.approx((1, 1))
 

@@ -200,6 +200,7 @@ def _judge_training_views(trainer: Trainer, scene: Scene, console: Console, step
     from unmix_plugin.commands.reporting import say, working
     from unmix_plugin.engine.runs.load_run import read_scene_record
     from unmix_plugin.engine.training.progress import write_event
+    from unmix_plugin.settings import UnmixModelConfig
     from unmix_plugin.trained.measured_errors import measure_errors, write_errors
     from unmix_plugin.trained.open_run import mixture_scene
     from unmix_plugin.trained.places import MeasuredScene
@@ -222,7 +223,9 @@ def _judge_training_views(trainer: Trainer, scene: Scene, console: Console, step
         if unexplained is not None:
             write_unexplained(run.path, unexplained, trained.materials)
             remarks += unexplained.in_words(run.path)
-        write_errors(run.path, measure_errors(trained, views), steps)
+        settings = trainer.config.pipeline.model
+        are_given = isinstance(settings, UnmixModelConfig) and settings.endmember_init == "file"
+        write_errors(run.path, measure_errors(trained, views, are_given=are_given), steps)
     for remark in remarks:
         say(console, f"warning: {remark}")
         write_event(run, remark)

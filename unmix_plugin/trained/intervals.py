@@ -49,10 +49,15 @@ class SeenPlaces:
 
     def of_number(self, number: Number, coverage: float = COVERAGE) -> tuple[Tensor, Tensor]:
         """The same of a number made of the spectrum; NaN also where it is undefined for spectra that are likely."""
-        common = self.errors.scene
-        factor = width_factor(common.spectrum_factors, coverage)
-        values = number(self.spectra)
-        half = factor * propagated_deviation(number, self.spectra, common.directions, self.errors.spectra)
+        common, spectra = self.errors.scene, self.spectra
+        of_shape = propagated_deviation(number, spectra, common.directions, self.errors.shape)
+        brighter = 1 + self.errors.brightness[..., None]
+        of_brightness = (number(spectra * brighter) - number(spectra * (2 - brighter))) / 2
+        half = (
+            (width_factor(common.shape_factors, coverage) * of_shape).square()
+            + (width_factor(common.brightness_factors, coverage) * of_brightness).square()
+        ).sqrt()
+        values = number(spectra)
         half = (
             self._where_seen(half)
             if half.dim() > self.opacity.dim()

@@ -138,13 +138,13 @@ class MeasuredSurface:
         errors, area = self.scene.errors, np.asarray(weights.sum())
         if isinstance(errors, str):
             return errors, Interval.unknown(area, COVERAGE, errors)
-        positions = torch.from_numpy(self.mesh.vertices).float()
         edge = float(area) ** 0.5 * self.scene.frame.scale
-        inside = weights > 0
-        found = errors.over_region(positions[torch.from_numpy(inside)], weights[inside], edge)
+        inside = torch.from_numpy(weights > 0)
+        within = (torch.from_numpy(self.mesh.vertices).float(), self._abundances, self._diffuse)
+        found = errors.over_region(errors.at(*(one[inside] for one in within)), weights[inside.numpy()], edge)
         if not bool(found.spectra.isfinite()):
             return found, Interval.unknown(area, COVERAGE, TOO_FEW_VIEWS)
-        whole = np.bincount(self.mesh.faces.ravel(), np.repeat(self.areas / 3, 3), len(positions))
+        whole = np.bincount(self.mesh.faces.ravel(), np.repeat(self.areas / 3, 3), len(weights))
         least = most = weights / np.maximum(whole, 1e-30)
         if isinstance(region, OfMaterial):
             margins = self._margins(region.material, errors, edge)
@@ -170,7 +170,7 @@ class MeasuredSurface:
     def _margins(self, material: int, errors: PlaceErrors, edge: float) -> Float64[np.ndarray, " V"]:
         """How far a material is above the largest other one at each vertex, in half widths of the interval that errors
         shared by a region with this edge (model units) leave; where errors are unknown, beyond any."""
-        local = errors.at(torch.from_numpy(self.mesh.vertices).float())
+        local = errors.at(torch.from_numpy(self.mesh.vertices).float(), self._abundances, self._diffuse)
         deviations = local.abundances.cpu().double().numpy()
         abundances = self._abundances.double().numpy()
         others = np.where(np.arange(abundances.shape[1]) == material, -1.0, abundances)

@@ -167,12 +167,17 @@ def interval_ends(name: str, materials: Materials) -> Ends:
 
         return of_band
     if name == "reflectance":
-        number = reflectance_number(materials)
-    elif output.score is not None and output.score.is_local and output.kind == "map":
+        to_reflectance = reflectance_number(materials)
+
+        def of_reflectance(seen: SeenPlaces, coverage: float) -> tuple[Tensor, Tensor]:
+            low, high = seen.of_spectra(coverage)
+            return to_reflectance(low), to_reflectance(high)
+
+        return of_reflectance
+    if output.score is not None and output.score.is_local and output.kind == "map":
         number = reflectance_number(materials, output.score.fit(torch.empty(0, len(materials.bands))))
-    else:
-        raise no_interval(name)
-    return lambda seen, coverage: seen.of_number(number, coverage)
+        return lambda seen, coverage: seen.of_number(number, coverage)
+    raise no_interval(name)
 
 
 def _interval(name: str, argument: str, materials: Materials) -> MaterialOutput:

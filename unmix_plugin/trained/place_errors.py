@@ -1,15 +1,17 @@
 """How far a scene is off at each place of it, by what its training views measured there.
 
 The surface is divided into cells, small ones within large ones. Of each cell the mean squared difference of what is
-rendered and what was measured is known: of spectra, and of abundances, which are compared with those that measured
-spectra have by themselves. Where a small cell has few pixels, the large one around it speaks for it, and the whole
-scene for that. How wide intervals have to be follows from leaving views out: the errors of each view are put beside
-what the cells say without that view.
+rendered and what was measured is known: of spectra, of their shape and brightness, and of abundances, which are
+compared with all that the measured spectra may be mixtures of. Where a small cell has few pixels, the large one around
+it speaks for it, and the whole scene for that. Within a cell, mixtures are further off than what is nearly pure or
+absent, and bright spectra than dark ones. How wide intervals have to be follows from leaving views out: the errors of
+each view are put beside what the cells say without that view.
 
 docs/background/uncertainty.md says what intervals cover and what they do not.
 
-Notation: `N` measured pixels, `P` places, `B` bands, `K` endmembers, `Q = K + 1` quantities (abundances, and spectra as
-a whole), `C` cells, `D` directions of errors, `L` coverages, `G` sizes of regions.
+Notation: `N` measured pixels, `P` places, `B` bands, `K` endmembers, `Q = K + 3` quantities (abundances, spectra as a
+whole, their shape, their brightness), `C` cells, `D` directions of errors, `L` coverages, `G` sizes of regions, `W`
+mixtures that a spectrum may be, `A` and `S` groups of abundances and of spectra by how large they are.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
-from unmix_plugin.spectral.intervals import width_factors
+from unmix_plugin.spectral.intervals import propagated_deviation, width_factors
 
 CELL_SIZES_PX = (12.0, 3.0)
 """Edges of cells, in pixels as large as they are in the middle of the scene."""
@@ -40,24 +42,32 @@ _LEAST_SQUARE = 1e-7
 """Added to mean squares: rounding of what was measured."""
 _INDEX_BITS = 20
 _HALF = 1 << (_INDEX_BITS - 1)
-_PRESENT = 0.01
+_PRESENT = 0.05
 """An abundance or what it is compared with has to be as large to decide how wide intervals are: an absent material is
 found to be absent, which says nothing of those that are there."""
+_ABUNDANCE_EDGES = (0.01, 0.03, 0.1, 0.25, 0.5, 0.75, 0.9, 0.97)
+"""Between groups of abundances."""
+_BRIGHTNESS_GROUPS = 10
+_CONTRAST_PIXELS, _CONTRASTS = 4000, 40
+"""By which it is found how wide intervals of numbers made of spectra have to be: so many contrasts of two bands."""
 
 
 @dataclass(frozen=True)
-class PixelErrors:
-    """What is rendered of measured pixels less what was measured."""
+class ComparedPixels:
+    """What is rendered of measured pixels beside what was measured."""
 
     positions: Float[Tensor, "N 3"]
     """Where the pixels' rays end, model space."""
     views: Int64[Tensor, "N"]
     """Which view measured."""
-    spectra: Float[Tensor, "N B"]
-    abundances: tuple[Float[Tensor, "N K"], ...]
-    """Against abundances of the measured spectra, by each way to unmix them."""
-    is_present: tuple[Float[Tensor, "N K"], ...]
-    """The larger of each pair of abundances."""
+    rendered: Float[Tensor, "N B"]
+    """Radiance, as if what is seen were opaque."""
+    measured: Float[Tensor, "N B"]
+    abundances: Float[Tensor, "N K"]
+    """Of what is rendered."""
+    possible: Float[Tensor, "W N K"]
+    """Abundances of the measured spectra: each way to unmix them, with each set of endmembers that they don't rule
+    out."""
 
 
 @dataclass(frozen=True)
@@ -121,13 +131,18 @@ class LocalErrors:
     """Standard deviation, NaN where too few views measured."""
     spectra: Float[Tensor, "*places"]
     """The same of spectra, in multiples of the usual one; NaN as above."""
+    shape: Float[Tensor, "*places"]
+    """The same of what is left of errors of spectra when they are as bright as each other."""
+    brightness: Float[Tensor, "*places"]
+    """Relative."""
     scene: PlaceErrors
     """Whose errors they are."""
 
     def to(self, device: torch.device | str) -> LocalErrors:
         """The same on another device."""
         scene = self.scene.map(lambda values: values.to(device))
-        return LocalErrors(self.abundances.to(device), self.spectra.to(device), scene)
+        spectral = (one.to(device) for one in (self.spectra, self.shape, self.brightness))
+        return LocalErrors(self.abundances.to(device), *spectral, scene=scene)
 
 
 @dataclass(frozen=True)
@@ -141,59 +156,120 @@ class PlaceErrors:
     large: Cells
     small: Cells
     usual: Float[Tensor, "Q"]
-    """Mean squared errors of the whole scene; of spectra 1, in units of the usual one."""
+    """Mean squared errors of the whole scene; of spectra and their shape 1, in units of the usual one."""
     directions: Float[Tensor, "D B"]
-    """Of errors of spectra: their usual covariance is directions^T directions."""
+    """Of errors of the shape of spectra: their usual covariance is directions^T directions."""
     band_deviations: Float[Tensor, "B"]
     """Usual root mean squared error of each band, radiance."""
+    endmember_deviations: Float[Tensor, "K B"]
+    """Expected errors of the endmembers, radiance."""
+    abundance_levels: Float[Tensor, "A"]
+    """Errors of abundances of each group in multiples of what cells say."""
+    brightness_edges: Float[Tensor, "edges"]
+    """Lengths of spectra between groups, radiance."""
+    brightness_levels: Float[Tensor, "S 3"]
+    """Errors of spectra of each group, their shape and their brightness, in multiples of what cells say."""
     abundance_factors: Float[Tensor, "L"]
     """Half widths of intervals in multiples of the deviation, for each of COVERAGES."""
     spectrum_factors: Float[Tensor, "L"]
+    shape_factors: Float[Tensor, "L"]
+    brightness_factors: Float[Tensor, "L"]
     abundance_alike: Float[Tensor, "G"]
     """Share of squared errors that is left in the mean over a region, for each size."""
     spectrum_alike: Float[Tensor, "G"]
 
     @staticmethod
-    def fit(errors: PixelErrors, origin: Float[Tensor, "3"], pixel_size: float) -> PlaceErrors | None:
-        """What errors of pixels tell; None where fewer than three views measured any."""
-        if len(errors.views.unique()) <= _FEWEST_VIEWS:
+    def fit(
+        pixels: ComparedPixels,
+        endmember_deviations: Float[Tensor, "K B"],
+        origin: Float[Tensor, "3"],
+        pixel_size: float,
+    ) -> PlaceErrors | None:
+        """What compared pixels tell; None where fewer than three views measured any."""
+        if len(pixels.views.unique()) <= _FEWEST_VIEWS:
             return None
-        spectra = errors.spectra.double()
-        band_squares = spectra.square().mean(dim=0) + _LEAST_SQUARE
-        of_spectra = (spectra.square() / band_squares).mean(dim=1, keepdim=True)
-        of_abundances = torch.stack([one.double().square() for one in errors.abundances]).mean(dim=0)
-        squares = torch.cat([of_abundances, of_spectra], dim=1)
-        usual = squares.mean(dim=0)
-
-        keys = [CellGrid(origin, size * pixel_size).keys(errors.positions) for size in CELL_SIZES_PX]
-        large, small = (_cells(own, errors.views, squares) for own in keys)
-        deviations = _without_own_view(keys, errors.views, squares, usual)
-        of_places, of_spectrum = deviations[:, :-1], deviations[:, -1:] * band_squares.sqrt()
-        present = torch.stack(errors.is_present) > _PRESENT
-        ratios = torch.stack([one.double().abs() / of_places for one in errors.abundances])
         generator = torch.Generator().manual_seed(0)
-        eigen = torch.linalg.eigh(spectra.T @ spectra / len(spectra))
-        kept = slice(-min(_DIRECTIONS, spectra.shape[1]), None)
+        rendered, abundances = pixels.rendered.double(), pixels.abundances.double()
+        spectra = rendered - pixels.measured.double()
+        lengths = rendered.norm(dim=1, keepdim=True).clamp(min=1e-6)
+        brightness = (spectra * rendered).sum(dim=1, keepdim=True) / lengths.square()
+        shape = spectra - brightness * rendered
+        band_squares, shape_squares = (one.square().mean(dim=0) + _LEAST_SQUARE for one in (spectra, shape))
+        deviations = abundances - pixels.possible.double()
+        squares = torch.cat(
+            [
+                deviations.square().mean(dim=0),
+                (spectra.square() / band_squares).mean(dim=1, keepdim=True),
+                (shape.square() / shape_squares).mean(dim=1, keepdim=True),
+                brightness.square(),
+            ],
+            dim=1,
+        )
+        usual = squares.mean(dim=0)
+        keys = [CellGrid(origin, size * pixel_size).keys(pixels.positions) for size in CELL_SIZES_PX]
+        large, small = (_cells(own, pixels.views, squares) for own in keys)
+        expected = _without_own_view(keys, pixels.views, squares, usual)
+
+        edges = torch.linspace(0, 1, _BRIGHTNESS_GROUPS + 1, dtype=torch.float64)[1:-1]
+        brightness_edges = torch.quantile(lengths[:, 0], edges)
+        of_abundances = torch.bucketize(abundances, abundances.new_tensor(_ABUNDANCE_EDGES))
+        of_spectra = torch.bucketize(lengths[:, 0], brightness_edges)
+        abundance_levels = _levels(
+            of_abundances, expected[:, :-3], squares[:, :-3], len(_ABUNDANCE_EDGES) + 1
+        )
+        brightness_levels = torch.stack(
+            [_levels(of_spectra, expected[:, i], squares[:, i], _BRIGHTNESS_GROUPS) for i in (-3, -2, -1)],
+            dim=1,
+        )
+        own = expected[:, :-3] * abundance_levels[of_abundances]
+        of_spectrum, of_shape, of_brightness = (expected[:, -3:] * brightness_levels[of_spectra]).unbind(
+            dim=1
+        )
+
+        ratios = deviations.abs() / own
+        present = torch.maximum(abundances.expand_as(ratios), pixels.possible) > _PRESENT
+        eigen = torch.linalg.eigh(shape.T @ shape / len(shape))
+        kept = slice(-min(_DIRECTIONS, shape.shape[1]), None)
         directions = (eigen.eigenvectors[:, kept] * eigen.eigenvalues[kept].clamp(min=0).sqrt()).T
-        sizes = [CellGrid(origin, size * pixel_size).keys(errors.positions) for size in _REGION_SIZES_PX]
-        mean_error = torch.stack([one.double() for one in errors.abundances]).mean(dim=0)
+        some = torch.randperm(len(shape), generator=generator)[:_CONTRAST_PIXELS]
+        contrasts = _contrasts(rendered.shape[1], generator)
+        missed = (contrasts(rendered[some]) - contrasts(pixels.measured[some].double())).abs()
+        foreseen = propagated_deviation(contrasts, rendered[some], directions, of_shape[some])
+
+        sizes = [CellGrid(origin, size * pixel_size).keys(pixels.positions) for size in _REGION_SIZES_PX]
+        every_way = deviations.transpose(0, 1).flatten(1)
+        of_bands = of_spectrum[:, None] * band_squares.sqrt()
         found = PlaceErrors(
-            origin.double(),
-            torch.tensor(pixel_size, dtype=torch.float64),
-            large,
-            small,
-            usual,
-            directions,
-            band_squares.sqrt(),
-            width_factors(ratios[present] if present.any() else ratios.flatten(), generator),
-            width_factors((spectra.abs() / of_spectrum).flatten(), generator),
-            torch.stack([_alike(one, mean_error) for one in sizes]),
-            torch.stack([_alike(one, spectra) for one in sizes]),
+            origin=origin.double(),
+            pixel_size=torch.tensor(pixel_size, dtype=torch.float64),
+            large=large,
+            small=small,
+            usual=usual,
+            directions=directions,
+            band_deviations=band_squares.sqrt(),
+            endmember_deviations=endmember_deviations.double(),
+            abundance_levels=abundance_levels,
+            brightness_edges=brightness_edges,
+            brightness_levels=brightness_levels,
+            abundance_factors=width_factors(
+                ratios[present] if present.any() else ratios.flatten(), generator
+            ),
+            spectrum_factors=width_factors((spectra.abs() / of_bands).flatten(), generator),
+            shape_factors=width_factors((missed / foreseen.clamp(min=1e-9)).flatten(), generator),
+            brightness_factors=width_factors(brightness[:, 0].abs() / of_brightness, generator),
+            abundance_alike=torch.stack([_alike(one, every_way) for one in sizes]),
+            spectrum_alike=torch.stack([_alike(one, spectra) for one in sizes]),
         )
         return found.map(lambda values: values.float() if values.is_floating_point() else values)
 
-    def at(self, positions: Float[Tensor, "*places 3"]) -> LocalErrors:
-        """At places of model space; unknown (NaN) where fewer than two views measured around."""
+    def at(
+        self,
+        positions: Float[Tensor, "*places 3"],
+        abundances: Float[Tensor, "*places K"],
+        spectra: Float[Tensor, "*places B"],
+    ) -> LocalErrors:
+        """At places of model space with these abundances and this radiance; unknown (NaN) where fewer than two views
+        measured around."""
         flat = positions.reshape(-1, 3).to(self.origin)
         squares = self.usual.expand(len(flat), -1)
         is_known = torch.zeros(len(flat), dtype=torch.bool, device=flat.device)
@@ -205,25 +281,29 @@ class PlaceErrors:
             if cells is self.large:
                 is_known = is_there & (cells.views[rows] >= _FEWEST_VIEWS)
         deviations = torch.where(is_known[:, None], (squares + _LEAST_SQUARE).sqrt(), torch.nan)
-        shape = positions.shape[:-1]
-        return LocalErrors(deviations[:, :-1].reshape(*shape, -1), deviations[:, -1].reshape(shape), self)
+        deviations = deviations.reshape(*positions.shape[:-1], -1)
+        edges = self.origin.new_tensor(_ABUNDANCE_EDGES)
+        levels = self.abundance_levels[torch.bucketize(abundances.to(edges), edges)]
+        lengths = spectra.to(self.origin).norm(dim=-1)
+        of_spectra = (
+            deviations[..., -3:] * self.brightness_levels[torch.bucketize(lengths, self.brightness_edges)]
+        )
+        return LocalErrors(deviations[..., :-3] * levels, *of_spectra.unbind(dim=-1), scene=self)
 
-    def over_region(
-        self, positions: Float[Tensor, "P 3"], weights: Float64[np.ndarray, " P"], edge: float
-    ) -> LocalErrors:
-        """Of means over a region of the surface, from places in it, what they weigh, and the edge of a square of its
-        area (model units)."""
-        own, parts = self.at(positions), torch.from_numpy(weights / weights.sum()).to(self.origin)
-        known = own.spectra.isfinite()
-        parts = torch.where(known, parts, 0.0)
+    def over_region(self, local: LocalErrors, weights: Float64[np.ndarray, " P"], edge: float) -> LocalErrors:
+        """Of means over a region of the surface, from errors at places in it, what these weigh, and the edge of a
+        square of its area (model units)."""
+        parts = torch.from_numpy(weights / weights.sum()).to(self.origin)
+        parts = torch.where(local.spectra.isfinite(), parts, 0.0)
         total = parts.sum()
         whole = torch.where(total >= 0.5, 1 / total.clamp(min=1e-12), torch.nan)
-        squares = [
-            whole * (parts.view(-1, *(1,) * (values.dim() - 1)) * values.nan_to_num().square()).sum(dim=0)
-            for values in (own.abundances, own.spectra)
-        ]
         of_abundances, of_spectra = self.alike(edge)
-        return LocalErrors((of_abundances * squares[0]).sqrt(), (of_spectra * squares[1]).sqrt(), self)
+        spectral = torch.stack([local.spectra, local.shape, local.brightness], dim=1)
+        means = [
+            (alike * whole * (parts[:, None] * values.nan_to_num().square()).sum(dim=0)).sqrt()
+            for alike, values in ((of_abundances, local.abundances), (of_spectra, spectral))
+        ]
+        return LocalErrors(means[0], *means[1].unbind(), scene=self)
 
     def alike(self, edge: float) -> tuple[float, float]:
         """Share of the squared errors of abundances, and of spectra, that is left in the mean over a region with this
@@ -296,6 +376,34 @@ def _without_own_view(
         others, of_others = counts[0] - counts[1], (sums[0] - sums[1]).clamp(min=0)
         expected = (of_others + _PRIOR_PIXELS * expected) / (others + _PRIOR_PIXELS)
     return (expected + _LEAST_SQUARE).sqrt()
+
+
+def _levels(
+    groups: Int64[Tensor, "*values"],
+    expected: Float[Tensor, "*values"],
+    squares: Float[Tensor, "*values"],
+    num: int,
+) -> Float[Tensor, "num"]:
+    """Root mean squared errors of each group in multiples of those that were expected; 1 of an empty group."""
+    found, foreseen = (
+        squares.new_zeros(num).index_add_(0, groups.flatten(), values.flatten())
+        for values in (squares, expected.square())
+    )
+    return torch.where(foreseen > 0, (found + _LEAST_SQUARE) / (foreseen + _LEAST_SQUARE), 1.0).sqrt()
+
+
+def _contrasts(
+    num_bands: int, generator: torch.Generator
+) -> Callable[[Float[Tensor, "N B"]], Float[Tensor, "N pairs"]]:
+    """Normalised differences of two bands, for pairs drawn at random."""
+    pairs = torch.randint(num_bands, (2, _CONTRASTS), generator=generator)
+    first, second = pairs[:, pairs[0] != pairs[1]] if num_bands > 1 else pairs
+
+    def contrasts(spectra: Float[Tensor, "N B"]) -> Float[Tensor, "N pairs"]:
+        a, b = spectra[:, first], spectra[:, second]
+        return (a - b) / (a + b).clamp(min=1e-3)
+
+    return contrasts
 
 
 def _alike(keys: Int64[Tensor, "N"], errors: Float[Tensor, "N Q"]) -> Float[Tensor, ""]:

@@ -33,7 +33,7 @@ from unmix_plugin.trained.intervals import SeenPlaces, as_interval
 from unmix_plugin.trained.measures import Scale
 from unmix_plugin.trained.mixture_view import MaterialOutput, MixtureView, components_of
 from unmix_plugin.trained.outputs import find_output, interval_ends
-from unmix_plugin.trained.place_errors import LocalErrors, PlaceErrors
+from unmix_plugin.trained.place_errors import PlaceErrors
 from unmix_plugin.trained.plain_outputs import available_outputs
 from unmix_plugin.trained.protocol import Probe, RenderedView, seen_place
 from unmix_plugin.trained.run_views import RunView, cameras_of
@@ -126,9 +126,10 @@ class MaterialView(MixtureView):
         errors, seen = self.scene.require_errors(), self.coefficients
         rays = self.camera.to(errors.origin.device).image_rays(0)
         positions = rays.at(seen.ray_distance.flatten().to(rays.origins)).view(*self.opacity.shape, 3)
-        local = errors.at(positions).to(self.opacity.device)
         opaque = self.opacity.clamp(min=1e-6)[..., None]
-        return SeenPlaces(self.spectra / opaque, seen.abundances / opaque, self.opacity, local)
+        spectra, abundances = self.spectra / opaque, seen.abundances / opaque
+        local = errors.at(positions, abundances, spectra).to(self.opacity.device)
+        return SeenPlaces(spectra, abundances, self.opacity, local)
 
     def map(self, function: Callable[[Tensor], Tensor]) -> MaterialView:
         """The same view with its coefficients on another device, or of some rows."""
@@ -301,7 +302,7 @@ class TrainedScene:
         if opacity > 0:
             rays = one.image_rays(0)
             place = _row(rays.at(found.ray_distance))
-        return Probe(
+        seen = Probe(
             {
                 "predicted": _row(diffuse + specular),
                 "diffuse": _row(diffuse),
@@ -312,15 +313,16 @@ class TrainedScene:
             opacity,
             place,
             None if place is None else self.frame.to_world(place[None])[0],
-            self.errors_at(place),
         )
+        return self._with_errors(seen)
 
-    def errors_at(self, position: Float64[np.ndarray, "3"] | None) -> LocalErrors | str:
-        """How far it is expected to be off at a place of model space, or why that is unknown, for people."""
-        errors = self.errors
-        if isinstance(errors, str) or position is None:
-            return errors if isinstance(errors, str) else "nothing is there"
-        return errors.at(torch.from_numpy(position).to(errors.origin))
+    def _with_errors(self, probe: Probe) -> Probe:
+        """The same that knows how far it is expected to be off, or why that is unknown, for people."""
+        errors, spectrum = self.errors, probe.values["predicted"] / max(probe.opacity, 1e-6)
+        if isinstance(errors, str) or probe.position is None:
+            return replace(probe, errors=errors if isinstance(errors, str) else "nothing is there")
+        place = (torch.from_numpy(one) for one in (probe.position, probe.abundances, spectrum))
+        return replace(probe, errors=errors.at(*(one.to(errors.origin) for one in place)))
 
     def interval(self, probe: Probe, name: str, coverage: float = COVERAGE) -> Interval:
         """Where an output at a place lies, with this probability; where that is unknown, the interval says why.
@@ -358,7 +360,7 @@ class TrainedScene:
         outputs = self.field.get_outputs(inside, -normals, features)
         is_there = self.renderer.is_occupied(inside).to(density)
         predicted = is_there[:, None] * (outputs["scaled_abundances"] @ self.materials.endmembers)
-        return Probe(
+        found = Probe(
             {
                 "predicted": _row(predicted),
                 "abundances": _row(is_there[:, None] * outputs["abundances"]),
@@ -367,8 +369,8 @@ class TrainedScene:
             float(is_there * -torch.expm1(-density * self.pixel_size)),
             place,
             world,
-            self.errors_at(place),
         )
+        return self._with_errors(found)
 
     def to(self, device: torch.device | str) -> TrainedScene:
         """The same scene on another device; `self` stays where it is."""

@@ -84,7 +84,7 @@ class PooledEndmembers:
 
 
 def pooled_search(
-    pixels: Float[Tensor, "N B"], num_endmembers: int, generator: torch.Generator
+    pixels: Float[Tensor, "N B"], num_endmembers: int, generator: torch.Generator, repeats: int = _REPEATS
 ) -> PooledEndmembers:
     """The best of the sets that several searches find, averaged with what is the same in others, among pixels neither
     dark nor saturated; errors are those of `two_material_endmembers`."""
@@ -107,7 +107,7 @@ def pooled_search(
 
     measured = drawn(_NUM_MEASURED)
     sets: list[Tensor] = []
-    for _ in range(_REPEATS):  # with judges of their own: errors of the same few pixels would not cancel
+    for _ in range(repeats):  # with judges of their own: errors of the same few pixels would not cancel
         sets += _pair_sets(shapes, *drawn(_NUM_JUDGES), num_endmembers, generator)
         sets += _archetypes(shapes, num_endmembers, generator)
         sets += _corners_and_clusters(shapes, num_endmembers, generator)
