@@ -24,7 +24,8 @@ import _machine
 import torch
 import tyro
 
-from unmix_plugin.engine.model import TrainingCallbackLocation, run_callbacks
+from unmix_plugin.engine.model import TrainingCallbackLocation
+from unmix_plugin.engine.training.steps import run_callbacks
 from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.model import UnmixModel
 from unmix_plugin.scenes.demo.scene import make_demo_scene

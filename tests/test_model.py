@@ -11,7 +11,7 @@ from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.model import UnmixModel
 from unmix_plugin.operators.compositing import volume_weights_twin
 from unmix_plugin.rendering.renderer import points_of
-from unmix_plugin.sensors.batches import from_batch
+from unmix_plugin.sensors.views import from_batch
 
 
 def naive_spectra(model: UnmixModel, rays) -> torch.Tensor:

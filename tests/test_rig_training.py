@@ -13,7 +13,7 @@ from tests.factories.scenes import make_rig
 from unmix_plugin.datamanager import HyperspectralDataManager
 from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.model import UnmixModel
-from unmix_plugin.sensors.batches import MeasuredPixels, from_batch, to_batch
+from unmix_plugin.sensors.views import MeasuredPixels, from_batch, to_batch
 from unmix_plugin.settings import HyperspectralDataManagerConfig, LossConfig
 
 BANDS = [2, 0, 3, 1]

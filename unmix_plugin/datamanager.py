@@ -53,10 +53,10 @@ from unmix_plugin.scenes.messages import Message
 from unmix_plugin.scenes.pixel_table import PixelRays, PixelTable
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.scenes.scene import check_recorded_scene, scene_identity
-from unmix_plugin.sensors.batches import MeasuredPixels, to_batch
+from unmix_plugin.sensors.views import MeasuredPixels, to_batch
 from unmix_plugin.settings import HyperspectralDataManagerConfig
 from unmix_plugin.spectral.bad_values import BandNoise
-from unmix_plugin.spectral.evidence import exposure_of
+from unmix_plugin.spectral.evidence import alpha_confidence, exposure_of
 from unmix_plugin.spectral.unmixing.endmembers import typical_spectrum
 
 _MANY_PIXELS = 4_000_000
@@ -109,7 +109,8 @@ class HyperspectralDataManager(DataManager):
         """Random valid pixels of the training views; the draw depends on (seed, step) only."""
         generator = step_generator(self.seed, step)
         rays, measured = [], []
-        for drawn in self._pixels.draw(self._pixels_for(self._num_rays), generator, step, self._shares):
+        count = self.get_train_rays_per_batch() // self._subpixels**2
+        for drawn in self._pixels.draw(count, generator, step, self._shares):
             rays.append(self._rays.through(drawn, self._subpixels, generator))
             own = MeasuredPixels(
                 sensor=drawn.sensor if self._is_rig else None,
@@ -117,7 +118,9 @@ class HyperspectralDataManager(DataManager):
                 spectra=drawn.spectra,
                 alpha=drawn.alpha,
                 pixels=drawn.numbers,
-                alpha_confidence=self._evidence.confidence(drawn),
+                alpha_confidence=alpha_confidence(
+                    drawn.spectra, drawn.alpha, self._evidence.levels[drawn.sensor]
+                ),
                 surfaces=self._surfaces.points(drawn),
             )
             measured.append(own)
@@ -145,7 +148,7 @@ class HyperspectralDataManager(DataManager):
 
     def get_train_rays_per_batch(self) -> int:
         """Rays of the next training batch."""
-        return self._pixels_for(self._num_rays) * self._subpixels**2
+        return max(1, self._num_rays // self._subpixels**2) * self._subpixels**2
 
     def set_train_rays_per_batch(self, num_rays: int) -> None:
         """Let the next training batches have `num_rays` rays, but whole pixels and at least one."""
@@ -324,9 +327,6 @@ class HyperspectralDataManager(DataManager):
     @cached_property
     def _surfaces(self) -> SurfaceEvidence:
         return SurfaceEvidence(self.scene, self.device)
-
-    def _pixels_for(self, num_rays: int) -> int:
-        return max(1, num_rays // self._subpixels**2)
 
     @cached_property
     def _shares(self) -> dict[int, float] | None:

@@ -37,8 +37,15 @@ from unmix_plugin.field import FieldSpace, GridField, UnmixField
 from unmix_plugin.light.lamp import Lamp
 from unmix_plugin.light.shading import ShadowDetail
 from unmix_plugin.losses.abundance_guide import AbundanceGuide, first_endmembers, first_specular_spectra
-from unmix_plugin.losses.comparison import BatchComparison, ComparedPixels
-from unmix_plugin.losses.terms import light_near_cameras, loss_weights, normals_error, stray_light
+from unmix_plugin.losses.terms import (
+    BatchComparison,
+    ComparedPixels,
+    light_near_cameras,
+    loss_weights,
+    normals_error,
+    pose_errors,
+    stray_light,
+)
 from unmix_plugin.operators.occupancy import OccupancyGrid
 from unmix_plugin.poses.refinement import PoseRefinement
 from unmix_plugin.poses.training import CorrectedRays, PoseTraining
@@ -47,8 +54,7 @@ from unmix_plugin.rendering.front_to_back import composite_view
 from unmix_plugin.rendering.grid_upkeep import GRID_INTERVAL, update_grid
 from unmix_plugin.rendering.published_field import PublishedField
 from unmix_plugin.rendering.renderer import RenderedRays, VolumeRenderer
-from unmix_plugin.sensors.batches import MeasuredPixels, from_batch
-from unmix_plugin.sensors.views import BandBalance, SensorViews, ViewGains
+from unmix_plugin.sensors.views import BandBalance, MeasuredPixels, SensorViews, ViewGains, from_batch
 from unmix_plugin.settings import COARSEST_REFINED, UnmixModelConfig
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
@@ -147,21 +153,6 @@ def new_grid(
     return OccupancyGrid(reachable, lamp_of(config) is not None, records_observed)
 
 
-def new_view_gains(config: UnmixModelConfig, metadata: Mapping[str, Any]) -> ViewGains | None:
-    """Gains of the training views; None where their exposure is one."""
-    if config.light != "per-view":
-        return None
-    return ViewGains(metadata["num_train_views"], torch.tensor(metadata["wavelengths_nm"]))
-
-
-def new_poses(config: UnmixModelConfig, metadata: Mapping[str, Any]) -> PoseRefinement | None:
-    """Corrections of the training views' poses; None where they are taken as they are."""
-    if config.poses != "refine":
-        return None
-    rows = metadata.get("line_rows") or [0] * metadata["num_train_views"]
-    return PoseRefinement(rows, config.pose_refinement.lens)
-
-
 @dataclass(frozen=True)
 class TrainingBatch:
     """What a training step compares, worked out once."""
@@ -215,8 +206,15 @@ class UnmixModel(Model):
         self.register_buffer("every_band", torch.eye(num_bands), persistent=False)
         self.register_buffer("endmember_bound", torch.ones(()))
         self.guide = AbundanceGuide(self.num_endmembers, num_bands)
-        self.view_gains = new_view_gains(config, metadata)
-        self.poses = new_poses(config, metadata)
+        self.view_gains: ViewGains | None = None
+        if config.light == "per-view":
+            self.view_gains = ViewGains(metadata["num_train_views"], torch.tensor(metadata["wavelengths_nm"]))
+        self.poses: PoseRefinement | None = None
+        self._pose_training: PoseTraining | None = None
+        if config.poses == "refine":
+            rows = metadata.get("line_rows") or [0] * metadata["num_train_views"]
+            self.poses = PoseRefinement(rows, config.pose_refinement.lens)
+            self._pose_training = PoseTraining(config.pose_refinement, self.poses)
         self.seen_by = SensorViews(metadata.get("sensors", ()), self.rgb_weights)
         weights = tuple(float(weight) for weight in config.losses.band_weights)
         self.balance = BandBalance(weights, scene.bands, self.seen_by)
@@ -229,7 +227,6 @@ class UnmixModel(Model):
             as_published=config.as_published,
             has_sky=self.field.has_sky,
         )
-        self._pose_training = PoseTraining(config.pose_refinement, self.poses)
         self._renderer: VolumeRenderer | None = None
         self._progress = 0.0
         self._occupied_share = torch.ones(())
@@ -263,15 +260,20 @@ class UnmixModel(Model):
         seen = self.balance.scaled(self.seen_by.project(endmembers, sensor), sensor)
         self.guide.start(pixels, endmembers, seen)
         self.specular_spectra.copy_(first_specular_spectra(len(self.specular_spectra), lamp, endmembers))
-        reachable = self._pose_training.begin(initial_data, self.scene_box, self.metadata["pixel_size"])
+        reachable = torch.from_numpy(initial_data["reachable"])
+        if self.poses is not None:
+            knots, pixel_size = torch.from_numpy(initial_data["knots"]), self.metadata["pixel_size"]
+            self.poses.begin(knots, self.scene_box, pixel_size)
+            reachable = torch.ones_like(reachable)  # poses that are off carve away what is there
         self.grid = new_grid(self.config, SceneTraits.of(self.metadata), reachable).to(self.device)
 
     @torch.no_grad()
     def between_steps(self, step: int, progress: float, data: DataManager) -> Collection[str]:
         """Keep empty what the masks carve away as seen by the corrected cameras, once poses hardly change any more."""
-        reachable = self._pose_training.between_steps(data)
-        if reachable is not None:
-            self.grid.empty_beyond(reachable.to(self.device))
+        if self._pose_training is not None:
+            reachable = self._pose_training.between_steps(data)
+            if reachable is not None:
+                self.grid.empty_beyond(reachable.to(self.device))
         return ()
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
@@ -336,8 +338,9 @@ class UnmixModel(Model):
             "samples_per_ray": torch.tensor(rendered.num_samples / num_rays),
             "visible_samples_per_ray": torch.tensor(len(rendered.weights) / num_rays),
             "occupied_share": self._occupied_share,
-            **self._pose_training.figures(step.corrected),
         }
+        if self.poses is not None and step.corrected.steps is not None:
+            metrics |= self.poses.figures(step.corrected.steps)
         if self.is_unbounded:
             metrics["matter_share"] = rendered.coefficients.accumulation.detach().mean()
         with torch.no_grad():
@@ -346,7 +349,9 @@ class UnmixModel(Model):
 
     def training_batch(self, ray_bundle: RayBundle, measured: list[MeasuredPixels]) -> TrainingBatch:
         """Rays of training views, rendered and laid beside what was measured along them; changes nothing."""
-        corrected = self._pose_training.corrected(ray_bundle)
+        corrected = CorrectedRays(ray_bundle)
+        if self._pose_training is not None:
+            corrected = self._pose_training.corrected(ray_bundle)
         rendered = self._rendered(corrected.rays)
         views, materials = ray_bundle.camera_indices, self.materials
         compared = self.comparison.compare(measured, rendered, views, materials, corrected.weights)
@@ -372,7 +377,9 @@ class UnmixModel(Model):
                 self.field.get_density, shading, places, rendered.weights, self.generator
             )
         weighed = {name: weights[name] * losses[name] for name in weights if name in losses}
-        return weighed | self._pose_training.penalty(step.corrected)
+        if self.poses is not None and step.corrected.steps is not None:
+            weighed["poses"] = self.poses.penalty(step.corrected.steps)
+        return weighed
 
     def update(self, step: TrainingBatch) -> None:
         """Note which cells the views see, and how far margins of abundances are from those of measured spectra."""
@@ -387,7 +394,8 @@ class UnmixModel(Model):
             densities = torch.cat([part.densities for part in rendered.evaluated])
             self.grid.record_observed(self.renderer.space.to_unit(positions.detach()), densities)
         self.comparison.update(step.compared)
-        self._pose_training.update(step.compared, step.corrected)
+        if self.poses is not None and step.corrected.knots is not None:
+            self.poses.robust.update(*pose_errors(step.compared, step.corrected.knots))
 
     def _rendered(self, rays: RayBundle) -> RenderedRays:
         renderer = self._training_renderer if self.training else self.renderer
@@ -483,7 +491,8 @@ class UnmixModel(Model):
 
     def _begin_step(self, step: int, progress: float) -> None:
         self._progress = progress
-        self._pose_training.begin_step(step, progress, self.field)
+        if self._pose_training is not None:
+            self._pose_training.begin_step(step, progress, self.field)
         if step % GRID_INTERVAL == 0:
             update_grid(
                 self.grid,
@@ -496,10 +505,12 @@ class UnmixModel(Model):
             )
             self._occupied_share = self.grid.occupied.float().mean()
             self.processes.reduce(self.guide.margin_variance, "mean")
-            self._pose_training.update_weights(self.processes)
+            if self._pose_training is not None:
+                self._pose_training.update_weights(self.processes)
 
     @torch.no_grad()
     def _bound_spectra(self, step: int, progress: float) -> None:
         self.endmembers.clamp_(min=0.0).clamp_(max=self.endmember_bound)
         self.specular_spectra.clamp_(0, 1)
-        self._pose_training.end_step()
+        if self._pose_training is not None:
+            self._pose_training.end_step()

@@ -13,11 +13,11 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
 from unmix_plugin.engine.runs.load_run import SceneRecord
 from unmix_plugin.field import CoefficientField
-from unmix_plugin.losses.comparison import ComparedPixels
+from unmix_plugin.losses.terms import ComparedPixels
 from unmix_plugin.model import TrainingBatch, UnmixModel
 from unmix_plugin.poses.training import CorrectedRays
 from unmix_plugin.rendering.renderer import RenderedRays
-from unmix_plugin.sensors.batches import from_batch
+from unmix_plugin.sensors.views import from_batch
 from unmix_plugin.settings import RendererConfig, UnmixFieldConfig, UnmixModelConfig
 from unmix_plugin.spectral.materials import Coefficients
 from unmix_plugin.trained.open_run import unmix_scene
@@ -112,5 +112,6 @@ def losses_of(
     sums = torch.tensor(sparsity), torch.tensor(certainty)
     rendered = RenderedRays(nothing, abundances, *sums, torch.zeros(0, 3), none, none.long(), ())
     [measured] = from_batch({"pixels": torch.arange(count), **batch}, count, model.seen_by.num_channels)
-    compared = ComparedPixels(measured, 1.0, slice(0, count, 1), spectra, opacities, abundances)
+    mixtures = model.comparison.unmix(measured)
+    compared = ComparedPixels(measured, 1.0, slice(0, count, 1), spectra, opacities, abundances, *mixtures)
     return model.losses(TrainingBatch(CorrectedRays(make_rays(count)), rendered, [compared]))

@@ -5,7 +5,7 @@ from tests.factories.mixtures import seeded, smooth_endmembers
 from unmix_plugin.losses import abundance_guide
 from unmix_plugin.losses.abundance_guide import AbundanceGuide, mixing_penalty
 from unmix_plugin.losses.terms import LossTerm
-from unmix_plugin.sensors.batches import MeasuredPixels
+from unmix_plugin.spectral.evidence import has_spectral_shape
 from unmix_plugin.spectral.unmixing.abundances import nnls, sparse_abundances
 from unmix_plugin.spectral.unmixing.two_material_mixtures import mean_pair_distance
 
@@ -23,14 +23,9 @@ def guide():
     return found
 
 
-def measured(spectra, alpha=1.0, first=0):
-    pixels = torch.arange(first, first + len(spectra))
-    return MeasuredPixels(None, len(spectra), spectra, torch.full((len(spectra),), alpha), pixels)
-
-
 def error(abundances, spectra, alpha=1.0):
-    mixtures, informative = guide().targets(measured(spectra, alpha), ENDMEMBERS)
-    weight = (informative[:, None].to(mixtures),)
+    mixtures = alpha * guide().unmix(torch.arange(len(spectra)), spectra, ENDMEMBERS)
+    weight = (has_spectral_shape(spectra)[:, None].to(mixtures),)
     return float(LossTerm(abundances, mixtures, weight, of_pixel="sum").loss())
 
 
@@ -87,8 +82,9 @@ def observed(deviation, steps=60):
         pure = torch.eye(4)[torch.randint(4, (200,), generator=generator)]
         mixed = share * pure + (1 - share) * pure.roll(1, dims=1)
         off = deviation / 2 * torch.randn(200, 1, generator=generator)
-        pixels = measured(mixed @ ENDMEMBERS, first=200 * step)
-        found.update(mixed + off * (pure - pure.roll(1, dims=1)), pixels, ENDMEMBERS)
+        mixtures = found.unmix(200 * step + torch.arange(200), mixed @ ENDMEMBERS, ENDMEMBERS)
+        counts = torch.ones(200, dtype=torch.bool)
+        found.update(mixed + off * (pure - pure.roll(1, dims=1)), mixtures, counts)
     return found
 
 
@@ -102,9 +98,9 @@ def test_the_error_of_margins_is_what_field_and_pixels_differ_by_widened_for_wha
 def test_what_does_not_count_or_is_not_finite_leaves_the_error_of_margins_as_it_was():
     known = observed(0.05, steps=3)
     before = known.margin_error.clone()
-    even = torch.full((4, 4), 0.25)
-    known.update(even, measured(torch.zeros(4, ENDMEMBERS.shape[1]), first=600), ENDMEMBERS)
-    known.update(torch.nan * even, measured(even @ ENDMEMBERS, first=604), ENDMEMBERS)
+    even, pure, every = torch.full((4, 4), 0.25), torch.eye(4), torch.ones(4, dtype=torch.bool)
+    known.update(even, pure, ~every)
+    known.update(torch.nan * even, pure, every)
     assert torch.equal(known.margin_error, before)
 
 
@@ -114,8 +110,7 @@ def test_remembered_mixtures_are_those_computed_anew_whatever_shares_a_slot(monk
     spectra = torch.rand(50, 4, generator=seeded(5)) @ ENDMEMBERS * 0.3
     for seed in range(20):
         pixels = torch.randint(50, (16,), generator=seeded(seed))
-        part = MeasuredPixels(None, 16, spectra[pixels], torch.ones(16), pixels)
         expected = sparse_abundances(spectra[pixels], ENDMEMBERS, cached.penalty)
-        first, again = (cached.targets(part, ENDMEMBERS)[0] for _ in range(2))
+        first, again = (cached.unmix(pixels, spectra[pixels], ENDMEMBERS) for _ in range(2))
         assert_close(first, expected, atol=1e-3, rtol=0)
         assert torch.equal(first, again)

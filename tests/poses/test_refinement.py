@@ -24,7 +24,7 @@ from unmix_plugin.poses import refinement as pose_refinement
 from unmix_plugin.poses.knots import Knots, row_waves
 from unmix_plugin.poses.refinement import LARGEST_RATIO, LARGEST_STEP, PoseRefinement, _RobustWeights
 from unmix_plugin.poses.training import PoseTraining
-from unmix_plugin.sensors.batches import MeasuredPixels
+from unmix_plugin.sensors.views import MeasuredPixels
 from unmix_plugin.settings import PoseConfig
 
 

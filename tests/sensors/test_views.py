@@ -10,8 +10,7 @@ from tests.factories.models import BOX, CONFIG, NUM_BANDS, WAVELENGTHS_NM, initi
 from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.model import UnmixModel
-from unmix_plugin.sensors.batches import MeasuredPixels
-from unmix_plugin.sensors.views import SensorViews, ViewGains, smooth_terms
+from unmix_plugin.sensors.views import MeasuredPixels, SensorViews, ViewGains, smooth_terms
 from unmix_plugin.settings import LossConfig, UnmixModelConfig
 from unmix_plugin.spectral.sensor import SceneSensor
 from unmix_plugin.spectral.unmixing.abundances import sparse_abundances

@@ -345,12 +345,3 @@ class TrainingCallback:
     func: Callable[[int, float], None]
     """Called with the step (0 for the first) and the training progress in [0, 1]: the fraction used up of whichever
     limit, steps or seconds, is nearer its end."""
-
-
-def run_callbacks(
-    callbacks: list[TrainingCallback], where: TrainingCallbackLocation, step: int, progress: float
-) -> None:
-    """Call those of `callbacks` that belong at `where`, in their order."""
-    for callback in callbacks:
-        if callback.where is where:
-            callback.func(step, progress)

@@ -70,7 +70,7 @@ class Pipeline(nn.Module):
 
     def seed_step(self, step: int) -> None:
         """Make everything that the model draws in training step `step` a function of (seed, step)."""
-        self.model.generator = step_generator(self.seed, step, self.model.device, _MODEL_STREAM)
+        self.model.generator = step_generator(self.seed, step, self.datamanager.device, _MODEL_STREAM)
         # For what takes no generator, such as dropout or NumPy.
         seed_everything(step_seed(self.seed, step, _MODEL_STREAM))
 

@@ -15,22 +15,19 @@ from collections.abc import Mapping
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
-from unmix_plugin.sensors.batches import MeasuredPixels
 from unmix_plugin.sensors.views import BandBalance, SensorViews
 from unmix_plugin.settings import UnmixModelConfig
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.evidence import OPAQUE_ALPHA
 from unmix_plugin.spectral.unmixing.abundances import nnls, sparse_abundances
 from unmix_plugin.spectral.unmixing.endmembers import (
     distinct_spectra,
     drop_uninformative_pixels,
     fill_bands,
     given_endmembers,
-    has_spectral_shape,
     initialise_endmembers,
 )
 from unmix_plugin.spectral.unmixing.two_material_mixtures import mean_pair_distance
@@ -77,23 +74,15 @@ class AbundanceGuide(nn.Module):
         self.endmembers.copy_(endmembers)
         self.penalty.fill_(mixing_penalty(pixels, seen))
 
-    def targets(
-        self, measured: MeasuredPixels, endmembers: Float[Tensor, "K b"]
-    ) -> tuple[Float[Tensor, "R K"], Bool[Tensor, "R"]]:
-        """What pixels are made of, in endmembers of the guide as their sensor sees them, summing to alpha as composited
-        abundances sum to the opacity; and which pixels tell."""
-        return measured.alpha[:, None] * self._mixtures_of(measured, endmembers), _is_informative(measured)
-
     def update(
-        self, abundances: Float[Tensor, "R K"], measured: MeasuredPixels, endmembers: Float[Tensor, "K b"]
+        self, abundances: Float[Tensor, "R K"], mixtures: Float[Tensor, "R K"], counts: Bool[Tensor, "R"]
     ) -> None:
-        """Follow how far margins of composited abundances are from those of the measured spectra."""
+        """Follow how far margins of composited abundances are from those of measured `mixtures`, by opaque pixels that
+        count."""
         if abundances.shape[1] == 1:
             return
-        few = measured.first(_OBSERVED_PIXELS)
-        counts = _is_informative(few) & (few.alpha > OPAQUE_ALPHA)
-        own, mixtures = abundances[:_OBSERVED_PIXELS].detach(), self._mixtures_of(few, endmembers)
-        largest = own.topk(2, dim=1)
+        few = slice(_OBSERVED_PIXELS)
+        largest, mixtures, counts = abundances[few].detach().topk(2, dim=1), mixtures[few], counts[few]
         margins = largest.values[:, 0] - largest.values[:, 1]
         first, second = mixtures.gather(1, largest.indices).unbind(1)
         counts = counts & (margins < _CLEAR_MARGIN)
@@ -104,19 +93,19 @@ class AbundanceGuide(nn.Module):
         self.margin_variance.copy_(torch.where((counts.sum() > 0) & variance.isfinite(), moved, before))
 
     @torch.no_grad()
-    def _mixtures_of(
-        self, measured: MeasuredPixels, endmembers: Float[Tensor, "K b"]
+    def unmix(
+        self, pixels: Int[Tensor, "R"], spectra: Float[Tensor, "R b"], endmembers: Float[Tensor, "K b"]
     ) -> Float[Tensor, "R K"]:
-        """Abundances of measured spectra, summing to 1, as mixtures of few endmembers; a spectrum's brightness does
-        not matter.
+        """Abundances of pixels by their numbers and measured spectra, summing to 1, as mixtures of few of the guide's
+        endmembers as their sensor sees them; a spectrum's brightness does not matter.
 
         A mixture depends on the pixel alone, and pixels come again, so those that were unmixed recently are kept: in a
         fixed number of slots, whatever the size of the scene. Values are kept, and given even the first time, in half
         precision, so that a resumed training sees the same ones.
         """
-        pixels, spectra, num_endmembers = measured.pixels, measured.spectra, len(self.endmembers)
         if len(self._keys) == 0:
-            num_slots, device = min(1 << 20, _CACHE_BYTES // (2 * num_endmembers)), self.endmembers.device
+            num_endmembers, device = len(self.endmembers), self.endmembers.device
+            num_slots = min(1 << 20, _CACHE_BYTES // (2 * num_endmembers))
             self._keys = torch.full((num_slots,), -1, dtype=torch.int64, device=device)
             self._mixtures = torch.zeros(num_slots, num_endmembers, dtype=torch.float16, device=device)
         slots = pixels % len(self._keys)
@@ -129,11 +118,6 @@ class AbundanceGuide(nn.Module):
             kept = is_new[self._keys[slots[is_new]] == pixels[is_new]]
             self._mixtures[slots[kept]] = values[kept]
         return values.to(spectra)
-
-
-def _is_informative(measured: MeasuredPixels) -> Bool[Tensor, "R"]:
-    found = has_spectral_shape(measured.spectra)
-    return found if measured.alpha_confidence is None else found & (measured.alpha_confidence > 0)
 
 
 def mixing_penalty(pixels: Float[Tensor, "N B"], endmembers: Float[Tensor, "K B"]) -> float:

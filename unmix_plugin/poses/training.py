@@ -1,4 +1,4 @@
-"""What a training does with poses that are corrected, step by step; nothing where they are taken as they are.
+"""What a training does with poses that are corrected, step by step.
 
 The levels of the field's grid join in the coarse part of the training, a little after whose start poses begin to move;
 at its end space is carved by the corrected cameras.
@@ -9,21 +9,18 @@ Notation: `X x Y x Z` cells of the occupancy grid, `N` rays, `M` knots of all vi
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
+from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.engine.model import DataManager
 from unmix_plugin.engine.processes import Processes
 from unmix_plugin.field import CoefficientField, GridField
-from unmix_plugin.losses.comparison import ComparedPixels, pose_errors
 from unmix_plugin.poses.refinement import PoseRefinement
 from unmix_plugin.settings import PoseConfig
 
@@ -74,23 +71,11 @@ def level_weights(num_levels: int, part: float) -> list[float]:
 class PoseTraining:
     """How far the refinement of poses has come."""
 
-    def __init__(self, config: PoseConfig, poses: PoseRefinement | None) -> None:
-        """`poses` is None where they are taken as they are."""
+    def __init__(self, config: PoseConfig, poses: PoseRefinement) -> None:
         self._config, self._poses = config, poses
         self._cameras: Cameras | None = None
         self._is_carved = False
         self._fineness = 0.0
-
-    def begin(
-        self, initial_data: Mapping[str, np.ndarray], box: SceneBox, pixel_size: float
-    ) -> Bool[Tensor, "X Y Z"]:
-        """Note where the cameras stand, and say which cells can be reached at first: poses that are off carve away what
-        is there."""
-        reachable = torch.from_numpy(initial_data["reachable"])
-        if self._poses is None:
-            return reachable
-        self._poses.begin(torch.from_numpy(initial_data["knots"]), box, pixel_size)
-        return torch.ones_like(reachable)
 
     def begin_step(self, step: int, progress: float, field: CoefficientField) -> None:
         """Let as many levels of the field's grid join as it is time for."""
@@ -101,13 +86,10 @@ class PoseTraining:
 
     def end_step(self) -> None:
         """Give views that lost their way their poses back."""
-        if self._poses is not None:
-            self._poses.restore_best(is_final=self._is_fine)
+        self._poses.restore_best(is_final=self._is_fine)
 
     def between_steps(self, data: DataManager) -> Bool[Tensor, "X Y Z"] | None:
         """Know the cameras; and once, when the levels of the grid have joined, what these can't carve away."""
-        if self._poses is None:
-            return None
         if self._cameras is None:
             self._cameras = data.train_cameras.to(self._poses.steps.device)
             self._is_carved = bool(self._poses.carved)  # once: reading it from a GPU takes time
@@ -119,8 +101,6 @@ class PoseTraining:
 
     def corrected(self, rays: RayBundle) -> CorrectedRays:
         """Training rays as their corrected cameras send them."""
-        if self._poses is None:
-            return CorrectedRays(rays)
         steps = self._poses.free_steps()
         if self._fineness < self._config.start:
             return CorrectedRays(rays, steps)
@@ -129,27 +109,10 @@ class PoseTraining:
         moved = self._poses(rays, self._cameras, steps, 1 / weights)
         return CorrectedRays(moved, steps, knots, weights) if self._is_fine else CorrectedRays(moved, steps)
 
-    def update(self, compared: Sequence[ComparedPixels], corrected: CorrectedRays) -> None:
-        """Note how well pixels fit, as far as it tells of their poses."""
-        if self._poses is not None and corrected.knots is not None:
-            self._poses.robust.update(*pose_errors(compared, corrected.knots))
-
     def update_weights(self, processes: Processes) -> None:
         """Decide which poses are outliers."""
-        if self._poses is not None and self._is_fine:
+        if self._is_fine:
             self._poses.robust.judge(processes)
-
-    def penalty(self, corrected: CorrectedRays) -> dict[str, Float[Tensor, ""]]:
-        """What large and rough corrections cost, as `poses`; nothing where none are made."""
-        if self._poses is None or corrected.steps is None:
-            return {}
-        return {"poses": self._poses.penalty(corrected.steps)}
-
-    def figures(self, corrected: CorrectedRays) -> dict[str, Tensor]:
-        """How far poses were corrected; nothing where they are not."""
-        if self._poses is None or corrected.steps is None:
-            return {}
-        return self._poses.figures(corrected.steps)
 
     @property
     def _is_fine(self) -> bool:

@@ -15,13 +15,12 @@ from torch.nn.functional import normalize
 
 from unmix_plugin.scenes.geometry.carving import Masks
 from unmix_plugin.scenes.geometry.lighting import Pictures, local_log_brightness
-from unmix_plugin.scenes.pixel_block import DrawnPixels, PixelBlock
+from unmix_plugin.scenes.pixel_block import PixelBlock
 from unmix_plugin.scenes.pixel_table import PixelTable
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.bad_values import BandNoise, judge_bands
 from unmix_plugin.spectral.evidence import (
     OPAQUE_ALPHA,
-    alpha_confidence,
     background_level,
     brightness,
     may_show_foreground,
@@ -43,23 +42,20 @@ class AlphaEvidence:
     def __init__(self, table: PixelTable, has_alpha: bool) -> None:
         """Judge the background of each sensor; without alpha nothing contradicts anything."""
         self._blocks = table.blocks
-        self._levels: dict[int, float | None] = {block.sensor: None for block in self._blocks}
+        self.levels: dict[int, float | None] = {block.sensor: None for block in self._blocks}
+        """Of each sensor the brightness of its background, as `alpha_confidence` takes it."""
         for block in self._blocks if has_alpha else ():
             stride = max(1, int(block.valid.sum()) // _PIXELS_OF_BACKGROUND)
             is_whole = bool(block.valid.all())  # then a list of all of them would take eight bytes a pixel
             pixels = torch.arange(0, len(block), stride) if is_whole else block.valid.nonzero()[::stride, 0]
             chosen = pixels.to(block.alpha.device)
-            self._levels[block.sensor] = background_level(block.spectra(chosen), block.alpha[chosen])
-
-    def confidence(self, pixels: DrawnPixels) -> Float[Tensor, " R"]:
-        """Confidence in the alpha of drawn pixels, 0 or 1."""
-        return alpha_confidence(pixels.spectra, pixels.alpha, self._levels[pixels.sensor])
+            self.levels[block.sensor] = background_level(block.spectra(chosen), block.alpha[chosen])
 
     def foreground(self) -> Masks:
         """For each training view True on pixels that may show something, or are not valid."""
         found: dict[int, np.ndarray] = {}
         for block in self._blocks:
-            level = self._levels[block.sensor]
+            level = self.levels[block.sensor]
 
             def shows(spectra: Tensor, alpha: Tensor, valid: Tensor, level: float | None = level) -> Tensor:
                 return may_show_foreground(spectra, alpha, level) | ~valid

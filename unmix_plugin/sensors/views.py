@@ -1,4 +1,5 @@
-"""What sensors see of spectra: channels of a rig's sensors, bands that count less, and gains of views.
+"""What sensors see of spectra: channels of a rig's sensors, bands that count less, and gains of views; and what they
+measured: the pixels of a training batch.
 
 A sensor None is a scene's only, ordinary camera, which sees spectra as they are. Where some bands are much noisier than
 others, errors of spectra are weighted in the loss; where spectra are compared by angle, as in unmixing, they are
@@ -7,14 +8,19 @@ balance of the views differ and nobody wrote them down, each has a gain that is 
 polynomial of second degree in the wavelength. What all views have in common is the scene's brightness, so the mean over
 views is taken out, and a new view has gain 1.
 
-Notation: `B` bands of the scene, `b` channels of a sensor, `K` endmembers, `R` pixels or rays, `V` training views, `T`
-terms.
+The pixels of one sensor are together in a batch, one sensor after the other; the rays of a pixel follow each other. The
+engine's batch of a rig has, beside what every batch has, `sensors`, `sensor_pixels` and `sensor_rays` (G each, on the
+CPU): which sensors some pixels are of, how many of each, and how many rays each such pixel has. `spectra` is 0 beyond a
+sensor's channels.
+
+Notation: `B` bands of the scene, `b` channels of a sensor, `G` sensors of a batch, `K` endmembers, `R` pixels or rays,
+`V` training views, `T` terms.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, SupportsInt
 
 import torch
@@ -22,9 +28,79 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.sensors.batches import MeasuredPixels
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.sensor import SceneSensor
+
+_COLUMNS = ("alpha", "pixels", "alpha_confidence", "surfaces")
+
+
+@dataclass(frozen=True)
+class MeasuredPixels:
+    """Pixels of one sensor."""
+
+    sensor: int | None
+    """Which of the scene's; None where it has one ordinary camera."""
+    num_rays: int
+    """Through all of them."""
+    spectra: Float[Tensor, "R b"]
+    alpha: Float[Tensor, "R"]
+    pixels: Int[Tensor, "R"]
+    """Number of each."""
+    alpha_confidence: Float[Tensor, "R"] | None = None
+    """Confidence in alpha, 0 or 1; None: 1 everywhere."""
+    surfaces: Float[Tensor, "R 3"] | None = None
+    """Places that the pixels are known to show, model space, NaN where unknown; None where none are known."""
+
+    def __len__(self) -> int:
+        return len(self.spectra)
+
+    def surfaces_of_rays(self) -> Float[Tensor, "rays 3"] | None:
+        """`surfaces` of the pixel of each ray."""
+        if self.surfaces is None:
+            return None
+        return self.surfaces.repeat_interleave(self.num_rays // len(self), dim=0)
+
+
+def to_batch(parts: Sequence[MeasuredPixels]) -> dict[str, Tensor]:
+    """The engine's batch of some pixels; those of a rig have numbers of sensors."""
+    most = max(part.spectra.shape[1] for part in parts)
+    padded = [torch.nn.functional.pad(part.spectra, (0, most - part.spectra.shape[1])) for part in parts]
+    batch = {"spectra": torch.cat(padded)}
+    for name in _COLUMNS:
+        columns = [getattr(part, name) for part in parts]
+        if columns[0] is not None:
+            batch[name] = torch.cat(columns)
+    sensors = [part.sensor for part in parts if part.sensor is not None]
+    if sensors:
+        batch["sensors"] = torch.tensor(sensors)
+        batch["sensor_pixels"] = torch.tensor([len(part) for part in parts])
+        batch["sensor_rays"] = torch.tensor([part.num_rays // len(part) for part in parts])
+    return batch
+
+
+def from_batch(
+    batch: dict[str, Tensor], num_rays: int, num_channels: Callable[[int], int]
+) -> list[MeasuredPixels]:
+    """The pixels of a batch, sensor by sensor.
+
+    Args:
+        batch: As `to_batch` makes it.
+        num_rays: Of the batch.
+        num_channels: Of a sensor.
+    """
+    columns = {name: batch[name] for name in _COLUMNS if name in batch}
+    if "sensors" not in batch:
+        return [MeasuredPixels(None, num_rays, batch["spectra"], **columns)]
+    groups = [batch[name].tolist() for name in ("sensors", "sensor_pixels", "sensor_rays")]
+    parts, start = [], 0
+    for sensor, pixels, rays in zip(*groups, strict=True):
+        rows = slice(start, start + pixels)
+        own = {name: values[rows] for name, values in columns.items()}
+        spectra = batch["spectra"][rows, : num_channels(sensor)]
+        parts.append(MeasuredPixels(sensor, pixels * rays, spectra, **own))
+        start = rows.stop
+    return parts
+
 
 _FEWEST_CHANNELS = 3
 """Of a sensor whose spectra tell materials apart."""
@@ -129,10 +205,6 @@ class BandBalance(nn.Module):
         if weights is None:
             return spectra
         return (spectra / (weights / weights.max()).sqrt().to(spectra)).clamp(0, 1)
-
-    def pixels(self, measured: MeasuredPixels) -> MeasuredPixels:
-        """Pixels with scaled spectra."""
-        return replace(measured, spectra=self.scaled(measured.spectra, measured.sensor))
 
 
 _NUM_TERMS = 3

@@ -17,6 +17,8 @@ from torch import Tensor
 
 OPAQUE_ALPHA = 0.99
 """From which on a pixel shows nothing of what is behind it."""
+DARK_RMS = 0.005
+"""Brightness up to which a pixel counts as black: the direction of its spectrum is noise."""
 _TRANSPARENT = 0.5 / 255
 """Largest alpha of a pixel that shows nothing."""
 _BLOWN_OUT = 0.9
@@ -45,6 +47,11 @@ _SURELY_LIT = 0.05
 def brightness(spectra: Float[Tensor, "R B"]) -> Float[Tensor, "R"]:
     """Root mean square over bands."""
     return spectra.square().mean(dim=-1).sqrt()
+
+
+def has_spectral_shape(spectra: Float[Tensor, "R B"]) -> Bool[Tensor, "R"]:
+    """Where a pixel is neither black (brightness at most 0.005) nor saturated (1 or above)."""
+    return (spectra.amax(dim=-1) < 1) & (brightness(spectra) > DARK_RMS)
 
 
 def is_blown_out(spectra: Float[Tensor, "*pixels B"]) -> Bool[Tensor, "*pixels"]:

@@ -18,8 +18,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from unmix_plugin.errors import SpectrumError
-from unmix_plugin.spectral.evidence import over_background
-from unmix_plugin.spectral.unmixing.endmembers import DARK_RMS
+from unmix_plugin.spectral.evidence import DARK_RMS, over_background
 
 SSIM_WINDOW_PX = 7
 _VALUES_AT_ONCE = 1 << 20

@@ -18,10 +18,11 @@ from unmix_plugin.engine.runs.atomic_files import whole_file, write_errors_as
 from unmix_plugin.engine.runs.replacing import remove
 from unmix_plugin.errors import RunError, SpectrumError
 from unmix_plugin.losses.abundance_guide import mixing_penalty
+from unmix_plugin.spectral.evidence import has_spectral_shape
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION
 from unmix_plugin.spectral.metrics import match_endmembers
 from unmix_plugin.spectral.unmixing.abundances import nnls, sparse_abundances
-from unmix_plugin.spectral.unmixing.endmembers import has_spectral_shape, usable_pixels
+from unmix_plugin.spectral.unmixing.endmembers import usable_pixels
 from unmix_plugin.spectral.unmixing.pooled_search import pooled_search
 from unmix_plugin.trained.place_errors import ComparedPixels, PlaceErrors
 from unmix_plugin.trained.trained_scene import TrainedScene

@@ -4,7 +4,7 @@ the first of these has a `Trainer`, the others follow it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from unmix_plugin.engine.configs import OptimizerConfig, TrainerConfig, place_of
 from unmix_plugin.engine.machine import resolve_device, seed_everything
-from unmix_plugin.engine.model import TrainingCallbackLocation, run_callbacks
+from unmix_plugin.engine.model import TrainingCallback, TrainingCallbackLocation
 from unmix_plugin.engine.pipeline import Pipeline
 from unmix_plugin.engine.processes import ALONE, Follower, Processes, joined, require_equal_settings
 from unmix_plugin.engine.registry import discover_methods
@@ -141,12 +141,14 @@ class TrainingSteps:
         """Take step number `step` at `progress` in [0, 1]. Raises RunError: loss and gradients stay non-finite, or
         another process has ended."""
         pipeline, datamanager = self.pipeline, self.pipeline.datamanager
-        pipeline.train()  # a viewer may have left it in evaluation mode
+        if not pipeline.model.training:  # a viewer may have left it in evaluation mode
+            pipeline.train()
         pipeline.seed_step(step)
         run_callbacks(self.callbacks, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, step, progress)
         with torch.no_grad():
             reset = pipeline.model.between_steps(step, progress, datamanager)
-        forget_gradients(self.optimizer, reset)
+        if reset:
+            forget_gradients(self.optimizer, reset)
         num_rays = datamanager.get_train_rays_per_batch()
         self.learning_rates = set_learning_rates(self.optimizer, self.configs, progress)
         outputs, losses, metrics = pipeline.get_train_loss_dict(step)
@@ -155,7 +157,8 @@ class TrainingSteps:
         self.optimizer.zero_grad()
         total.backward()
         wanted = pipeline.model.next_num_rays(outputs, num_rays)
-        total, wanted = self._averaged(total, wanted)
+        if self.processes.count > 1:
+            total, wanted = self._averaged(total, wanted)
         is_finite, loss = self.guard.check(total)
         if is_finite:
             self.optimizer.step()
@@ -169,12 +172,19 @@ class TrainingSteps:
 
     def _averaged(self, total: Tensor, wanted: int | None) -> tuple[Tensor, int | None]:
         """Gradients, loss and the rays wanted for the next step, as means over the processes."""
-        if self.processes.count == 1:
-            return total, wanted
         parameters = [param for group in self.optimizer.param_groups for param in group["params"]]
         rays = total.new_tensor(float("nan") if wanted is None else float(wanted))
         total, rays = self.processes.average_gradients(parameters, [total, rays])
         return total, None if wanted is None else max(1, int(rays))
+
+
+def run_callbacks(
+    callbacks: Iterable[TrainingCallback], where: TrainingCallbackLocation, step: int, progress: float
+) -> None:
+    """Call those of `callbacks` that belong at `where`, in their order."""
+    for callback in callbacks:
+        if callback.where is where:
+            callback.func(step, progress)
 
 
 def _require_losses(losses: Mapping[str, Any], kind: type) -> None:

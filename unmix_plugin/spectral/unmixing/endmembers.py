@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.evidence import DARK_RMS
 from unmix_plugin.spectral.library.spectra_csv import read_spectra
 from unmix_plugin.spectral.unmixing.abundances import nnls
 from unmix_plugin.spectral.unmixing.kmeans_normalised import normalised_kmeans, scale_to_lit_pixels
@@ -26,8 +27,6 @@ _MOST_PIXELS = 20_000
 """That endmembers are searched in; more are thinned out at random."""
 _VCA_DRAWS = 5
 """Of which that of the largest simplex stays. The other methods restart by themselves, as often."""
-DARK_RMS = 0.005
-"""Root mean square over bands below which a pixel counts as black: its direction is noise."""
 _DARK_SHARE = 0.03
 """Pixels darker than this share of the bright ones (99th percentile) say little about material either."""
 _SMOOTHNESS = 1e-3
@@ -94,11 +93,6 @@ def drop_uninformative_pixels(pixels: Float[Tensor, "N B"]) -> Float[Tensor, "ke
     rms = unsaturated.square().mean(dim=1).sqrt()
     bright = float(rms.kthvalue(max(1, round(0.99 * len(rms)))).values)
     return unsaturated[rms > max(DARK_RMS, _DARK_SHARE * bright)]
-
-
-def has_spectral_shape(pixels: Float[Tensor, "N B"]) -> Bool[Tensor, " N"]:
-    """Where a pixel is neither black (root mean square over bands at most 0.005) nor saturated (1 or above)."""
-    return (pixels.amax(dim=1) < 1) & (pixels.square().mean(dim=1).sqrt() > DARK_RMS)
 
 
 def _log_volume(spectra: Float[Tensor, "K B"]) -> float:
