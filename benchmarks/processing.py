@@ -26,7 +26,7 @@ import _machine
 import numpy as np
 import tyro
 
-from unmix_plugin.captures.sample import sampled_rows
+from unmix_plugin.captures.calibration.calibration import sampled_rows
 
 PEAK_GB = _common.Limit(1.5, is_upper=True, unit=" GB")
 RESUMED_VIEWS = 2

@@ -17,7 +17,7 @@ from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.captures.posing import complete_rigs, place_poses, pose_views
-from unmix_plugin.captures.process import _refuse_late
+from unmix_plugin.captures.process import refuse_late_lenses
 from unmix_plugin.captures.report import Code, Kind, sentences
 from unmix_plugin.captures.writing.scene_files import write_points
 from unmix_plugin.errors import CaptureError
@@ -185,6 +185,6 @@ def test_views_without_any_help_are_left_out_and_said_and_those_of_no_shot_left_
 
 def test_a_lens_that_pixels_would_be_brought_into_is_refused_once_they_are_written():
     bent = replace(SMALL_LENS, resampled_from=SMALL_LENS.pixels_of)
-    _refuse_late({})
+    refuse_late_lenses({})
     with pytest.raises(CaptureError, match="the lens of a is not found in the pictures"):
-        _refuse_late({"a": bent})
+        refuse_late_lenses({"a": bent})

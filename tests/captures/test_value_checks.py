@@ -9,11 +9,11 @@ import pytest
 from PIL import Image
 
 from tests.factories.files import file_of
+from unmix_plugin.captures.checks import ViewSample, check_files, check_values
 from unmix_plugin.captures.cube import BandTable, CaptureView
 from unmix_plugin.captures.decide import is_below_black
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.report import Kind, sentences
-from unmix_plugin.captures.value_checks import ViewSample, check_files, check_values
 from unmix_plugin.captures.writing.view_files import ViewRecord
 
 BAND = np.arange(12)

@@ -14,12 +14,12 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float32
 
+from unmix_plugin.captures.calibration.calibration import BRIGHT_PERCENTILE, StoredCounts, WhiteSample
 from unmix_plugin.captures.calibration.references import stated_reflectance
 from unmix_plugin.captures.camera_tags import radiometric_model
 from unmix_plugin.captures.cube import Cube
 from unmix_plugin.captures.options import MaskKind
 from unmix_plugin.captures.report import Code, Remark
-from unmix_plugin.captures.sample import BRIGHT_PERCENTILE, StoredCounts, WhiteSample
 from unmix_plugin.captures.spoilt import ViewPixels
 from unmix_plugin.captures.writing.view_files import BackgroundRule
 from unmix_plugin.engine.sampling import robust_deviation
@@ -38,12 +38,12 @@ _FAR_BRIGHTER, _LEAST_COMPARED, _MOST_USUAL = 1.5, 4, 0.75
 the share of them that must not be so."""
 _MOST_REFLECTANCE = 1.5
 """Of bright pixels with highlights."""
-_MOST_ABOVE_ONE = 0.01
+MOST_ABOVE_ONE = 0.01
 """Share of reflectances above 1 that is still taken for highlights."""
 _MOST_BEYOND, _HEADROOM = 1.25, 1.02
 """The brightest sampled value over the bright percentile up to which there are no glints; and what is left above the
 brightest, as not all pixels are sampled."""
-_LEAST_BRIGHT = 0.05
+LEAST_BRIGHT = 0.05
 """Bright values below this would lose digits if they were kept."""
 _MOST_BELOW, _LEAST_LEVEL, _PILED_UP = 0.02, 0.005, 0.84
 """Share of a band's values below 0, and their mean over what is bright and over their root mean square, above which a
@@ -208,23 +208,12 @@ def choose_scale(
             "check the dark frame: is it as bright as the views?"
         )
     above = float((values > 1.0).mean())
-    if all(one.has_one for one in meanings) and above <= _MOST_ABOVE_ONE and bright >= _LEAST_BRIGHT:
+    if all(one.has_one for one in meanings) and above <= MOST_ABOVE_ONE and bright >= LEAST_BRIGHT:
         kept = f"values are kept ({meanings[0].description}); {above:.2%} of the sampled ones are above 1"
         return Scale(1.0, kept)
     if (brightest := float(values.max())) <= _MOST_BEYOND * bright:  # no glints, which would darken the rest
         return Scale(float(f"{_HEADROOM * brightest:.4g}"), "a little more than the brightest sampled value")
     return Scale(float(f"{bright:.4g}"), f"the {BRIGHT_PERCENTILE:g}th percentile of the sampled values")
-
-
-def doubts_of_scale(meanings: Sequence[ValueMeaning], scale: Scale, has_white: bool) -> list[Remark]:
-    """A remark where a 1 that means something is lost."""
-    if scale.is_given or scale.value == 1.0 or not all(one.states_one for one in meanings):
-        return []
-    code = Code.ONE_LOST_ABOVE if scale.value > 1 else Code.ONE_LOST_BELOW
-    units = ", ".join(dict.fromkeys(one.description for one in meanings))
-    limit = f"{_MOST_ABOVE_ONE:.0%}" if scale.value > 1 else f"{_LEAST_BRIGHT:g}"
-    hint = " (was the white exposed and lit as the views were?)" if has_white else ""
-    return [Remark.of(code, units=units, scale=f"{scale.value:g}", limit=limit, hint=hint)]
 
 
 def is_below_black(sample: Float32[np.ndarray, "N c"]) -> bool:

@@ -175,8 +175,26 @@ class MatchedScene:
 
 
 def views_of_other_poses(scene: MatchedScene) -> dict[str, Remark]:
-    """Views whose pictures do not fit their poses, while those of the others do."""
-    found = _misplaced(scene)
+    """Views whose pictures do not fit their poses, while those of the others do: that show points elsewhere than where
+    the others place them, the worst first, or share nothing with those around them."""
+    found: dict[str, Remark] = {}
+    shrunk, rest = _shrunk(scene.lens), scene
+    most = int(_MOST_OTHER_POSES * len(scene.names))
+    while True:
+        rest = rest.without(found)
+        misses = {star.views[0]: star.centre_miss_px() for star in rest.stars}
+        misses = {view: miss for view, miss in misses.items() if np.isfinite(miss)}
+        if len(misses) < _LEAST_VIEWS + 1:
+            break
+        worst, usual = max(misses, key=lambda view: misses[view]), float(np.median([*misses.values()]))
+        if misses[worst] < max(_POSES_OFF_PX, _TIMES_USUAL_MISS * usual):
+            break
+        pixels = {"miss_px": misses[worst] / shrunk, "usual_px": usual / shrunk}
+        name = scene.names[worst]
+        found[name] = Remark.of(Code.VIEW_OF_OTHER_POSE, [name], **pixels)
+        if len(found) > most:
+            found = {}
+            break
     found |= _among_strangers(scene.without(found))
     return found if len(found) <= _MOST_OTHER_POSES * len(scene.names) else {}
 
@@ -222,26 +240,6 @@ def _off_epipolar_lines_px(seen: tuple[Points, Points], one: PosedCamera, other:
     lines = np.cross(moved, second @ (turns[0].T @ turns[1]).T)
     away = np.abs((lines * first).sum(axis=1)) / np.maximum(np.linalg.norm(lines[:, :2], axis=1), 1e-12)
     return float(np.median(away)) * _shrunk(one.lens) * float(np.mean(one.lens.focal_px))
-
-
-def _misplaced(scene: MatchedScene) -> dict[str, Remark]:
-    """Views that show points elsewhere than where the others place them; the worst first."""
-    found: dict[str, Remark] = {}
-    shrunk = _shrunk(scene.lens)
-    most = int(_MOST_OTHER_POSES * len(scene.names))
-    while len(found) <= most:
-        scene = scene.without(found)
-        misses = {star.views[0]: star.centre_miss_px() for star in scene.stars}
-        misses = {view: miss for view, miss in misses.items() if np.isfinite(miss)}
-        if len(misses) < _LEAST_VIEWS + 1:
-            return found
-        worst, usual = max(misses, key=lambda view: misses[view]), float(np.median([*misses.values()]))
-        if misses[worst] < max(_POSES_OFF_PX, _TIMES_USUAL_MISS * usual):
-            return found
-        pixels = {"miss_px": misses[worst] / shrunk, "usual_px": usual / shrunk}
-        name = scene.names[worst]
-        found[name] = Remark.of(Code.VIEW_OF_OTHER_POSE, [name], **pixels)
-    return {}
 
 
 def check_matches(scene: MatchedScene, findings: list[str]) -> str:
@@ -366,15 +364,6 @@ def _find_star(
     return _Star(ideal, poses[:, :, :3] @ FLIP, poses[:, :, 3], focal_px, tuple(views))
 
 
-def _nearest_in_own_view(features: tuple[Points, np.ndarray]) -> Float64[np.ndarray, " P"]:
-    """Difference of each feature from the one most like it at another place of the same view."""
-    places, descriptors = features[0], features[1].astype(np.float64)
-    squares = (descriptors**2).sum(axis=1)
-    differences = squares[:, None] + squares - 2 * descriptors @ descriptors.T
-    same = np.linalg.norm(places[:, None] - places, axis=-1) < _SAME_PLACE_PX
-    return np.sqrt(np.where(same, np.inf, np.maximum(differences, 0)).min(axis=1))
-
-
 def _matches(
     one: _Features, other: _Features, shrunk: float
 ) -> tuple[Int[np.ndarray, " M"], Int[np.ndarray, " M"]]:
@@ -389,7 +378,13 @@ def _matches(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of descriptors that differ by nothing, samples that tell nothing
         found = match_descriptors(one[1], other[1], max_ratio=_MOST_AMBIGUOUS, cross_check=True)
-        alone = [_nearest_in_own_view(view) for view in (one, other)]
+        alone = []  # difference of each feature from the one most like it at another place of its own view
+        for places, descriptors in (one, other):
+            precise = descriptors.astype(np.float64)
+            squares = (precise**2).sum(axis=1)
+            differences = squares[:, None] + squares - 2 * precise @ precise.T
+            same = np.linalg.norm(places[:, None] - places, axis=-1) < _SAME_PLACE_PX
+            alone.append(np.sqrt(np.where(same, np.inf, np.maximum(differences, 0)).min(axis=1)))
         apart = np.linalg.norm(one[1][found[:, 0]].astype(float) - other[1][found[:, 1]], axis=1)
         repeated = np.minimum(alone[0][found[:, 0]], alone[1][found[:, 1]])
         found = found[apart < _MOST_REPEATED * repeated]

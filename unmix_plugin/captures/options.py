@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -126,6 +127,20 @@ class ProcessOptions:
     overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Replace a scene that this command made in the output folder."""
 
+    @property
+    def paths_read(self) -> list[tuple[str, Path]]:
+        """What is named that is there and is read, each with its flag."""
+        texts = {
+            "--poses": self.poses,
+            "--angles": self.angles,
+            "--wavelengths": self.wavelengths,
+            "--white-reflectance": self.white_reflectance,
+        }
+        named = [("--data", self.data), ("--dark", self.dark), ("--white", self.white)]
+        named += [(flag, Path(text)) for flag, text in texts.items() if text is not None]
+        named += [] if self.poses is None else [("--poses", self.data / self.poses)]
+        return [(flag, path) for flag, path in named if path is not None and os.path.lexists(path)]
+
 
 def check_options(options: ProcessOptions) -> None:
     """Refuse what no capture makes right. Raises ConfigError: a layout that is none, options that don't go together, or
@@ -150,22 +165,6 @@ def check_options(options: ProcessOptions) -> None:
         raise ConfigError(f"--max-noise {options.max_noise:g}: expected a share above 0")
 
 
-def _check_line_options(options: ProcessOptions) -> None:
-    """Raises ConfigError: an option does not go with line cameras, or with others."""
-    if options.layout != LINES:
-        if (options.field_of_view, options.line_rate, options.camera_axes) != (None, None, "opengl"):
-            raise ConfigError(f"--field-of-view, --line-rate and --camera-axes go with the layout '{LINES}'")
-        return
-    if options.poses in FROM_PICTURES:
-        raise ConfigError(
-            f"--poses {options.poses} finds one pose a picture, while each line of a scan has its own; give a table"
-        )
-    if options.known_distance is not None:
-        raise ConfigError("--known-distance follows frame cameras alone; name the unit in the table: x (mm)")
-    if options.line_rate is not None and not 0 < options.line_rate < float("inf"):
-        raise ConfigError(f"--line-rate {options.line_rate:g}: expected lines a second, above 0")
-
-
 def check_pose_options(options: ProcessOptions, names: Sequence[str]) -> None:
     """Refuse what does not go together in finding poses, before anything is computed.
 
@@ -175,7 +174,17 @@ def check_pose_options(options: ProcessOptions, names: Sequence[str]) -> None:
         ConfigError: an option is wrong, or asks for what this way of finding poses does not use.
         CaptureError: a library that is needed is not installed.
     """
-    _check_line_options(options)
+    if options.layout != LINES:
+        if (options.field_of_view, options.line_rate, options.camera_axes) != (None, None, "opengl"):
+            raise ConfigError(f"--field-of-view, --line-rate and --camera-axes go with the layout '{LINES}'")
+    elif options.poses in FROM_PICTURES:
+        raise ConfigError(
+            f"--poses {options.poses} finds one pose a picture, while each line of a scan has its own; give a table"
+        )
+    elif options.known_distance is not None:
+        raise ConfigError("--known-distance follows frame cameras alone; name the unit in the table: x (mm)")
+    elif options.line_rate is not None and not 0 < options.line_rate < float("inf"):
+        raise ConfigError(f"--line-rate {options.line_rate:g}: expected lines a second, above 0")
     for flag, value in (("--marker-size", options.marker_size), ("--marker-family", options.marker_family)):
         if value is not None and options.poses not in FROM_PICTURES:
             raise ConfigError(f"{flag} goes with --poses {', '.join(FROM_PICTURES)}; give one of them")
@@ -202,9 +211,9 @@ def parse_mosaic(text: str | None) -> tuple[int, int] | None:
     >>> parse_mosaic("2x4")
     (2, 4)
     """
-    found = None if text is None else re.fullmatch(r"\s*(\d{1,2})\s*[xX×]\s*(\d{1,2})\s*", text)  # noqa: RUF001
     if text is None:
         return None
+    found = re.fullmatch(r"\s*(\d{1,2})\s*[xX×]\s*(\d{1,2})\s*", text)  # noqa: RUF001
     if found is None or not 1 < int(found[1]) * int(found[2]) <= 256 or min(int(found[1]), int(found[2])) < 1:
         raise ConfigError(f"--mosaic {text}: expected rows x columns of filters, such as 4x4")
     return int(found[1]), int(found[2])

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -16,24 +16,34 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
 from unmix_plugin.captures.calibration.bands import BandChoice, stated_bands, without_bad, without_unlit
-from unmix_plugin.captures.calibration.calibration import Calibration, Raster
+from unmix_plugin.captures.calibration.calibration import (
+    Calibration,
+    Raster,
+    WhiteSample,
+    border_pixels,
+    bright_values,
+    count_stored,
+    draw_pixels,
+    rows_behind,
+)
 from unmix_plugin.captures.calibration.exposures import (
     ComparedExposures,
     ExposedFiles,
     compare_exposures,
     exposure_of,
 )
-from unmix_plugin.captures.calibration.references import GivenReferences, SensorReferences, find_references
+from unmix_plugin.captures.calibration.references import GivenReferences, find_references
 from unmix_plugin.captures.camera_tags import radiometric_model
 from unmix_plugin.captures.cube import Capture, CaptureView, Cube
 from unmix_plugin.captures.decide import (
+    LEAST_BRIGHT,
+    MOST_ABOVE_ONE,
     Saturation,
     Scale,
     ValueMeaning,
     background_rule,
     choose_mask,
     choose_scale,
-    doubts_of_scale,
     find_meaning,
     find_saturation,
     is_below_black,
@@ -43,22 +53,17 @@ from unmix_plugin.captures.decide import (
 )
 from unmix_plugin.captures.options import MaskKind, ProcessOptions
 from unmix_plugin.captures.poses.pose_set import PosedCamera
+from unmix_plugin.captures.posing import PosedViews
 from unmix_plugin.captures.report import Code, Remark
-from unmix_plugin.captures.sample import (
-    PixelSample,
-    WhiteSample,
-    border_pixels,
-    bright_values,
-    count_stored,
-    draw_pixels,
-    rows_behind,
-)
 from unmix_plugin.captures.spoilt import judge_values
 from unmix_plugin.captures.writing.view_files import BackgroundRule, ViewRecipe, alpha_picture
+from unmix_plugin.engine.decisions import UNDECIDED, Decision
 from unmix_plugin.engine.sampling import evenly_spaced
+from unmix_plugin.errors import CaptureError
 from unmix_plugin.scenes.backdrops import Backdrop, judge_backdrop
 from unmix_plugin.spectral.bands import Bands
 
+_BACKDROP_VIEWS = 12
 _BACKDROP_VIEWS = 12
 """Views that a backdrop is looked for in."""
 _WHITE_PERCENTILE = 99.0
@@ -67,6 +72,8 @@ _LEAST_END = 0.9
 """Of what is written as 1: saturated values below are too far off. Columns and bands differ in their ends a little."""
 _FEW_PERCENTILE = 5.0
 """Of saturated values: nearly the darkest."""
+_MOST_LISTED = 4
+"""Views and bands that are left out, in the table of decisions."""
 
 
 @dataclass(frozen=True)
@@ -115,24 +122,6 @@ class SensorPlan:
                 used[name] = {"file": str(of_all.file.path), "use": of_all.how}
         return used
 
-    def to_json(self) -> dict[str, Any]:
-        """What was decided and from what, for the record."""
-        dropped = [
-            {
-                "band": index,
-                "wavelength_nm": float(self.bands.wavelengths_nm[index]),
-                "reason": band.reason,
-            }
-            for index, band in sorted(self.bands.dropped.items())
-        ]
-        facts = {
-            "saturation": {"stored": self.saturation.stored, "evidence": self.saturation.reason},
-            **self.references_used,
-            "wavelengths": self.bands.source,
-            "dropped_bands": dropped,
-        }
-        return facts | ({"irradiance": dict(self.irradiance)} if self.irradiance else {})
-
 
 @dataclass(frozen=True)
 class Plan:
@@ -153,6 +142,12 @@ class Plan:
     """Views that nothing was decided from, as they are spoilt, and why."""
 
     @property
+    def backdrops_in_words(self) -> str:
+        """The backdrops that were found, those of all sensors; empty without any."""
+        found = [recipe.background for recipe in self.recipes.values()]
+        return ", ".join(each.in_words for each in found if isinstance(each, Backdrop))
+
+    @property
     def decisions(self) -> dict[str, Any]:
         """With their reasons, as JSON-able values."""
         from unmix_plugin.spectral.colour.conversion import describe_colour
@@ -160,12 +155,20 @@ class Plan:
         each = {}
         for name, sensor in self.sensors.items():
             raster, rule = sensor.calibration.raster, self.recipes[name].background
+            nm = sensor.bands.wavelengths_nm
             each[name or "all views"] = {
                 "unit": sensor.meaning.description,
                 "bands": len(sensor.centers_nm),
                 "size": [raster.height, raster.width],
                 "colours": describe_colour(Bands(sensor.centers_nm)),
-                **sensor.to_json(),
+                "saturation": {"stored": sensor.saturation.stored, "evidence": sensor.saturation.reason},
+                **sensor.references_used,
+                "wavelengths": sensor.bands.source,
+                "dropped_bands": [
+                    {"band": index, "wavelength_nm": float(nm[index]), "reason": band.reason}
+                    for index, band in sorted(sensor.bands.dropped.items())
+                ],
+                **({"irradiance": dict(sensor.irradiance)} if sensor.irradiance else {}),
                 "background": None if rule is None else rule.evidence,
             }
         scale = {"calibrated": self.scale.value, "evidence": self.scale.reason}
@@ -189,6 +192,8 @@ def make_plan(
         CaptureError: views don't fit each other or the references, or a file can't be read.
         ConfigError: an option does not fit the files.
     """
+    from unmix_plugin.spectral.colour.conversion import rgb_matrix
+
     by_sensor: dict[str, list[CaptureView]] = defaultdict(list)
     for view in views:
         by_sensor[view.sensor].append(view)
@@ -200,27 +205,28 @@ def make_plan(
     sensors = with_one_exposure(sensors, {name: same[0].cube for name, same in by_sensor.items()})
     left_out = {name: remark for sensor in sensors.values() for name, remark in sensor.left_out.items()}
 
-    meanings = [sensor.meaning for sensor in sensors.values()]
-    usual = [sensor.usual_sample.ravel() for sensor in sensors.values()]
-    scale = choose_scale(meanings, np.concatenate(usual), options.scale)
-
+    scale = choose_scale(
+        [sensor.meaning for sensor in sensors.values()],
+        np.concatenate([sensor.usual_sample.ravel() for sensor in sensors.values()]),
+        options.scale,
+    )
     sound = {name: [view for view in same if view.name not in left_out] for name, same in by_sensor.items()}
-    mask, backgrounds, remarks_on_mask = _decide_mask(options.mask, views, sensors, sound, scale.value)
-    recipes = {
-        name: ViewRecipe(
-            sensor.calibration,
-            scale.value,
-            _colours_of(sensor, scale.value),
-            backgrounds[name],
-            use_opacity=mask == "files",
+    mask, backgrounds, on_mask = _decide_mask(options.mask, views, sensors, sound, scale.value)
+    recipes = {}
+    for name, sensor in sensors.items():
+        # To linear red, green and blue, in which bright pixels of the sample are white.
+        to_rgb = rgb_matrix(Bands(sensor.centers_nm)).numpy()
+        shown = ((sensor.sample / np.float32(scale.value)) @ to_rgb).max(axis=1)
+        white = float(np.percentile(shown, _WHITE_PERCENTILE)) if len(shown) else 0.0
+        to_rgb = to_rgb / np.float32(white) if white > 0 else to_rgb
+        recipes[name] = ViewRecipe(
+            sensor.calibration, scale.value, to_rgb, backgrounds[name], use_opacity=mask == "files"
         )
-        for name, sensor in sensors.items()
-    }
 
-    files = [(view.name, file) for view in views for file in (view.cube, *view.references)]
-    files += [(file.path.name, file) for file in given.files]
+    of_files = [(view.name, file) for view in views for file in (view.cube, *view.references)]
+    of_files += [(file.path.name, file) for file in given.files]
+    of_files = [(name, remark) for name, file in of_files for remark in file.remarks]
     texts = (options.wavelengths or "", options.white_reflectance)  # numbers, or the name of a table
-    tables = filter(os.path.isfile, texts)
     return Plan(
         capture=capture,
         views=tuple(views),
@@ -231,20 +237,14 @@ def make_plan(
         remarks=(
             *(Remark.of(Code.NOTE, text=text) for text in capture.notes),
             *(Remark.of(Code.CAPTURE_WARNING, text=text) for text in capture.warnings),
-            *(remark for sensor in sensors.values() for remark in sensor.remarks),
-            *_doubts_of_references(sensors, scale),
-            *remarks_on_mask,
-            *_doubts_of_kinds(sensors, scale, views),
-            *_remarks_on_pictures([view.cube for view in views]),
+            *_remarks_on_values(sensors, scale, [view.cube for view in views], on_mask),
             *(one for view in views for one in view.cube.remarks if not one.code.looks_wrong),
-            *(
-                replace(one, where=(name,))
-                for name, file in files
-                for one in file.remarks
-                if one.code.looks_wrong
-            ),
+            *(replace(one, where=(name,)) for name, one in of_files if one.code.looks_wrong),
         ),
-        option_files=(*(path for file in given.files for path in file.files), *map(Path, tables)),
+        option_files=(
+            *(path for file in given.files for path in file.files),
+            *map(Path, filter(os.path.isfile, texts)),
+        ),
         left_out=left_out,
     )
 
@@ -336,9 +336,8 @@ def plan_sensor(
         )
         compared = compare_exposures(exposed)
 
-    raster = Raster.of(first.shape[0], first.shape[1], options.crop, options.bin_pixels)
     calibration = Calibration(
-        raster,
+        Raster.of(first.shape[0], first.shape[1], options.crop, options.bin_pixels),
         bands.kept,
         references=references,
         saturation=saturation.stored,
@@ -347,15 +346,27 @@ def plan_sensor(
     drawn = draw_pixels(views, calibration)
     spoilt = judge_values(drawn, cameras)
     left_out = {name: remark for name, remark in spoilt.items() if name not in options.keep_view}
-    pixels = PixelSample(tuple(view for view in drawn if view.name not in left_out))
-    pixels.require(first.path)
-    values, saturated = pixels.values, pixels.saturated
+    drawn = [view for view in drawn if view.name not in left_out]
+    if not any(len(view.values) for view in drawn):
+        raise CaptureError(
+            f"{first.path}: no sampled pixel of it and of the other views has a measurement in all bands (NaN, "
+            "no-data, or no light on the white panel); check these, or leave bands out with --drop-bands"
+        )
+    values, saturated = (
+        np.concatenate([getattr(view, name) for view in drawn]) for name in ("values", "saturated")
+    )
 
     bands, found = without_bad(bands, values, saturated, options.max_noise)
     bands = bands.without_incomplete_bins(binning)
     bands.require(binning, str(first.path))
     still_kept = np.isin(calibration.bands, bands.kept)
     at_end = values[:, still_kept][saturated[:, still_kept]]
+    lamp = None
+    if references.whites:
+        white = references.whites[0]
+        lamp = (white.signal / white.reflectance)[bands.kept].astype(np.float32)
+        lamp = lamp.reshape(-1, binning).mean(axis=1).astype(np.float64)
+        lamp = np.clip(lamp, 0.0, None) / lamp.max()
     models = {view.name: radiometric_model(view.cube) for view in views}
     irradiance = {name: one.irradiance for name, one in models.items() if one and one.irradiance is not None}
     return SensorPlan(
@@ -364,25 +375,13 @@ def plan_sensor(
         saturation=saturation,
         meaning=find_meaning(files, bool(references.whites)),
         sample=values[:, still_kept].reshape(len(values), -1, binning).mean(axis=2),
-        is_usual=usual_pixels(pixels.views, still_kept),
+        is_usual=usual_pixels(drawn, still_kept),
         saturated_from=float(np.percentile(at_end, _FEW_PERCENTILE)) if len(at_end) else np.inf,
-        lamp=_lamp_of(references, bands, binning),
+        lamp=lamp,
         irradiance=irradiance,
         remarks=(*remarks, *compared.remarks, *found),
         left_out=left_out,
     )
-
-
-def _lamp_of(
-    references: SensorReferences, bands: BandChoice, binning: int
-) -> Float64[np.ndarray, " c"] | None:
-    """Light on the first white panel as the detector sees it, greatest value 1."""
-    if not references.whites:
-        return None
-    white = references.whites[0]
-    lamp = (white.signal / white.reflectance)[bands.kept].astype(np.float32)
-    lamp = lamp.reshape(-1, binning).mean(axis=1).astype(np.float64)
-    return np.clip(lamp, 0.0, None) / lamp.max()
 
 
 def with_one_exposure(sensors: dict[str, SensorPlan], first: dict[str, Cube]) -> dict[str, SensorPlan]:
@@ -397,6 +396,8 @@ def with_one_exposure(sensors: dict[str, SensorPlan], first: dict[str, Cube]) ->
         for name, sensor in sensors.items()
         if not sensor.calibration.references.whites
     }
+    if len(bare) < 2:
+        return sensors
     known = {name: exposure for name, exposure in bare.items() if exposure is not None}
     rest = [name for name in bare if name not in known]
     files = [
@@ -406,7 +407,7 @@ def with_one_exposure(sensors: dict[str, SensorPlan], first: dict[str, Cube]) ->
         # What is wrong with those of one sensor was said of it.
         and (exposure_of(first[name]) is not None or first[name].exposure.time is None)
     ]
-    if len(bare) < 2 or not files:
+    if not files:
         return sensors
     exposed = ExposedFiles(
         files,
@@ -428,47 +429,138 @@ def with_one_exposure(sensors: dict[str, SensorPlan], first: dict[str, Cube]) ->
     return brought
 
 
-def _doubts_of_references(sensors: Mapping[str, SensorPlan], scale: Scale) -> Iterator[Remark]:
-    """What may be wrong with the references, by the values that come of them."""
-    has_white = any(sensor.calibration.references.whites for sensor in sensors.values())
-    yield from doubts_of_scale([sensor.meaning for sensor in sensors.values()], scale, has_white)
-    if any(is_below_black(sensor.sample) for sensor in sensors.values()):
-        yield Remark.of(Code.BELOW_BLACK)
-
-
-def _doubts_of_kinds(
-    sensors: Mapping[str, SensorPlan], scale: Scale, views: Sequence[CaptureView]
-) -> Iterator[Remark]:
-    """Sensors whose values are of different kinds, and saturated values that are written as more than they may be."""
+def _remarks_on_values(
+    sensors: Mapping[str, SensorPlan], scale: Scale, files: Sequence[Cube], on_mask: Sequence[Remark]
+) -> list[Remark]:
+    """What a user should know of the values of all sensors: what was remarked of each, a 1 that means something and is
+    lost, references that don't fit, sensors of different kinds, saturated values that are written as more than they may
+    be; and of pictures their encoding, order of colours and orientation."""
     meanings = [sensor.meaning for sensor in sensors.values()]
+    remarks = [remark for sensor in sensors.values() for remark in sensor.remarks]
+    if not scale.is_given and scale.value != 1.0 and all(one.states_one for one in meanings):
+        has_white = any(sensor.calibration.references.whites for sensor in sensors.values())
+        facts = {
+            "units": ", ".join(dict.fromkeys(one.description for one in meanings)),
+            "scale": f"{scale.value:g}",
+            "limit": f"{MOST_ABOVE_ONE:.0%}" if scale.value > 1 else f"{LEAST_BRIGHT:g}",
+            "hint": " (was the white exposed and lit as the views were?)" if has_white else "",
+        }
+        remarks.append(Remark(Code.ONE_LOST_ABOVE if scale.value > 1 else Code.ONE_LOST_BELOW, facts))
+    if any(is_below_black(sensor.sample) for sensor in sensors.values()):
+        remarks.append(Remark.of(Code.BELOW_BLACK))
+    remarks += on_mask
     kinds = {(meaning.has_one, meaning.states_one): meaning.description for meaning in meanings}
-    if len(kinds) > 1 and not any(view.cube.is_srgb for view in views):
-        yield Remark.of(Code.UNLIKE_MEANINGS, kinds=[*kinds.values()])
+    if len(kinds) > 1 and not any(file.is_srgb for file in files):
+        remarks.append(Remark.of(Code.UNLIKE_MEANINGS, kinds=[*kinds.values()]))
     end = min(sensor.saturated_from for sensor in sensors.values())
     if end < _LEAST_END * scale.value:
-        yield Remark.of(Code.SATURATED_BELOW_ONE, end=f"{end:.3g}", scale=f"{scale.value:g}")
+        facts = {"end": f"{end:.3g}", "scale": f"{scale.value:g}"}
+        remarks.append(Remark(Code.SATURATED_BELOW_ONE, facts))
 
-
-def _colours_of(sensor: SensorPlan, scale: float) -> Float32[np.ndarray, "c 3"]:
-    """From spectra to linear red, green and blue, in which bright pixels of the sample are white."""
-    from unmix_plugin.spectral.colour.conversion import rgb_matrix
-
-    to_rgb = rgb_matrix(Bands(sensor.centers_nm)).numpy()
-    shown = ((sensor.sample / np.float32(scale)) @ to_rgb).max(axis=1)
-    white = float(np.percentile(shown, _WHITE_PERCENTILE)) if len(shown) else 0.0
-    return to_rgb / np.float32(white) if white > 0 else to_rgb
-
-
-def _remarks_on_pictures(files: Sequence[Cube]) -> Iterator[Remark]:
-    """Encoding, order of colours and orientation; none where there is no picture."""
     pictures = [file for file in files if file.reader == "picture"]
     if any(file.is_srgb for file in pictures):
-        yield Remark.of(Code.PICTURES_ARE_SRGB)
-    for centres in (file.bands.wavelengths_nm for file in pictures):
-        if centres is not None and len(centres) == 3 and centres[0] < centres[2]:
-            red, green, blue = (f"{centre:g}" for centre in centres)
-            yield Remark.of(Code.COLOURS_IN_ORDER, red=red, green=green, blue=blue)
-            break
-    turned = sum(file.orientation != 1 for file in files)
-    if turned:
-        yield Remark.of(Code.ORIENTATION_IGNORED, turned=turned, files=len(files))
+        remarks.append(Remark.of(Code.PICTURES_ARE_SRGB))
+    centres = (file.bands.wavelengths_nm for file in pictures)
+    red_last = (one for one in centres if one is not None and len(one) == 3 and one[0] < one[2])
+    if (found := next(red_last, None)) is not None:
+        colours = {name: f"{nm:g}" for name, nm in zip(("red", "green", "blue"), found, strict=True)}
+        remarks.append(Remark(Code.COLOURS_IN_ORDER, colours))
+    if turned := sum(file.orientation != 1 for file in files):
+        remarks.append(Remark.of(Code.ORIENTATION_IGNORED, turned=turned, files=len(files)))
+    return remarks
+
+
+def decisions_of(
+    plan: Plan, posed: PosedViews, left_out: Sequence[Remark], options: ProcessOptions
+) -> list[Decision]:
+    """The table of all that was decided: what, from what, what would have spoken against it and was looked for, and the
+    option that overrides it. Decisions on single sensors have their names."""
+    reasons = {remark.where[0]: remark.code.name.removeprefix("VIEW_").lower() for remark in left_out}
+    listed = {name: reasons[name].replace("_", " ") for name in [*reasons][:_MOST_LISTED]}
+    more = {"others": len(reasons) - len(listed)} if len(reasons) > len(listed) else {}
+    used = len(posed.views)
+    decisions = [
+        Decision(
+            "views",
+            f"{used} used, {len(reasons)} left out" if reasons else f"all {used} are used",
+            {**listed, **more},
+            "neighbours that are alike, or more than a quarter of the views",
+            "--keep-view, --leave-out",
+        )
+    ]
+    for name, sensor in plan.sensors.items():
+        where, references = f" of {name}" if name else "", sensor.references_used
+        for key, what, outcome, against in (
+            ("dark", "dark frame", "subtracted", "values that pile up below 0"),
+            (
+                *("white", "white reference", "divided by"),
+                "bands in which it is saturated, dark, or not above the dark frame",
+            ),
+        ):
+            if key in references:
+                decisions.append(Decision(f"{what}{where}", outcome, references[key], against, f"--{key}"))
+        exposure, brought = sensor.calibration.exposure, "not compared"
+        if exposure is not None:
+            ends = dict.fromkeys(f"{number:g}" for number in (exposure.min(), exposure.max()))
+            brought = f"all brought to {' to '.join(ends)} s"
+        stored, dropped, nm = sensor.saturation.stored, sensor.bands.dropped, sensor.bands.wavelengths_nm
+        listed = {f"{nm[index]:g} nm": dropped[index].reason for index in sorted(dropped)[:_MOST_LISTED]}
+        more = {"others": len(dropped) - len(listed)} if len(dropped) > len(listed) else {}
+        decisions += [
+            Decision(
+                f"exposure{where}",
+                brought,
+                {},
+                "a time, gain or f-number that one file states and another lacks; values that are reflectance already",
+            ),
+            Decision(
+                f"saturation{where}",
+                UNDECIDED if stored is None else f"from {stored:g}",
+                {"from": sensor.saturation.reason},
+                "numbers that are not whole, or none that crowd at the greatest",
+                "--saturation",
+            ),
+            Decision(
+                f"bands{where}",
+                f"{len(sensor.bands.kept)} of {len(nm)} kept",
+                {**listed, **more},
+                f"more than half of the bands noisier than {options.max_noise:g} of their signal",
+                "--drop-bands, --max-noise",
+            ),
+        ]
+    above = max(
+        (float((sensor.sample > plan.scale.value).mean()) for sensor in plan.sensors.values()), default=0.0
+    )
+    masks = {
+        "auto": "a backdrop that all views share is cut out",
+        "files": "from files",
+        "none": "none: all of each view is the scene",
+    }
+    is_estimated = not posed.poses.has_world
+    has_lines = any(camera.lines is not None for camera in posed.poses.cameras.values())
+    return [
+        *decisions,
+        Decision(
+            "scale",
+            f"{plan.scale.value:g} is written as 1",
+            {"sampled values above": above, "from": plan.scale.reason},
+            "views that are far brighter than most, which it does not follow",
+            "--scale",
+        ),
+        Decision(
+            "mask",
+            masks.get(plan.mask, plan.mask),
+            {"asked": options.mask, **({"backdrop": found} if (found := plan.backdrops_in_words) else {})},
+            "borders with texture, or that differ between views" if options.mask == "auto" else "",
+            "--mask",
+        ),
+        Decision(
+            "poses",
+            f"{'estimated' if is_estimated else 'read'}: {posed.poses.source}",
+            {"views": used},
+            "cameras that jump between lines, or look away from each other"
+            if has_lines
+            else "points shared by views that lie elsewhere by the poses",
+            "--poses" if options.poses is None or not is_estimated else "--poses FILE",
+        ),
+    ]

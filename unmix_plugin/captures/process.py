@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -12,7 +11,6 @@ import numpy as np
 
 from unmix_plugin.captures.calibration.references import GivenReferences, require_comparable
 from unmix_plugin.captures.cube import Capture, CaptureView, Cube, ReadOptions
-from unmix_plugin.captures.decisions import decisions_of
 from unmix_plugin.captures.finding_poses import marked_poses, poses_of_written_views
 from unmix_plugin.captures.layouts.masks import with_mask_files
 from unmix_plugin.captures.match_checks import views_of_other_poses
@@ -27,9 +25,8 @@ from unmix_plugin.captures.options import (
     find_views,
     parse_mosaic,
 )
-from unmix_plugin.captures.plan import Plan, make_plan
+from unmix_plugin.captures.plan import Plan, decisions_of, make_plan
 from unmix_plugin.captures.poses.lens import Lens
-from unmix_plugin.captures.poses.pose_set import PosedCamera
 from unmix_plugin.captures.posing import PosedViews, asked_distance, given_poses, pose_views
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.report import Code, Kind, Remark, sentences
@@ -72,9 +69,8 @@ def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list
     refuse_output(options.output_dir, options.overwrite)
     folder = WorkFolder(options.output_dir)
     folder.refuse_foreign()
-    require_apart((folder.output, folder.path), _paths_read(options))
-    references = _open_references(options)
-    capture = _open_capture(options, references)
+    require_apart((folder.output, folder.path), options.paths_read)
+    references, capture = _open_capture(options)
     say(f"{capture.root}: {len(capture.views)} views of the layout {capture.layout}")
     check_pose_options(options, capture.names)
     distance = asked_distance(options, capture.views)
@@ -110,7 +106,15 @@ def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list
 
     # Examine: what is written; views that don't belong are left out of the scene.
     left_out |= unreadable
-    left_out |= _blurred(plan, records, cameras, {*left_out, *options.keep_view})
+    for sensor in plan.sensors:
+        sharpness = {
+            name: record.sharpness
+            for name, record in records.items()
+            if record.sensor == sensor and name not in plan.left_out
+        }
+        blurred = judge_sharpness(sharpness, cameras)
+        kept = {*left_out, *options.keep_view}
+        left_out |= {name: remark for name, remark in blurred.items() if name not in kept}
     sound = {name: record for name, record in records.items() if name not in left_out}
     if all(record.matter_share == 0.0 for record in sound.values()):
         raise CaptureError(
@@ -121,7 +125,7 @@ def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list
         say("estimating poses ...")
         found = poses_of_written_views(plan, sound, folder.path, folder.poses, options)
         posed = pose_views(_without(plan.views, left_out), found, distance)
-        _refuse_late(_resampled_lenses(plan, posed))
+        refuse_late_lenses(_resampled_lenses(plan, posed))
     for note in sentences(posed.remarks, Kind.DONE):
         say(f"poses: {note}")
     posed = replace(posed, views=tuple(_without(posed.views, left_out)))
@@ -195,24 +199,6 @@ def _wanted_views(capture: Capture, options: ProcessOptions) -> tuple[list[Captu
     return _without(wanted, left_out), left_out
 
 
-def _blurred(
-    plan: Plan,
-    records: Mapping[str, ViewRecord],
-    cameras: Mapping[str, PosedCamera] | None,
-    judged: Collection[str],
-) -> dict[str, Remark]:
-    """Views that are blurred, without those that are judged already."""
-    found: dict[str, Remark] = {}
-    for sensor in plan.sensors:
-        sharpness = {
-            name: record.sharpness
-            for name, record in records.items()
-            if record.sensor == sensor and name not in plan.left_out
-        }
-        found |= judge_sharpness(sharpness, cameras)
-    return {name: remark for name, remark in found.items() if name not in judged}
-
-
 def _resampled_lenses(plan: Plan, posed: PosedViews) -> dict[str, tuple[Lens, list[float]]]:
     """Lenses of the views whose pixels are brought into another lens, as the scene has them, and numbers that tell each
     from others."""
@@ -228,8 +214,9 @@ def _resampled_lenses(plan: Plan, posed: PosedViews) -> dict[str, tuple[Lens, li
     return found
 
 
-def _refuse_late(lenses: Collection[str]) -> None:
-    """Refuse lenses that pictures would have to be brought into, as they are written already."""
+def refuse_late_lenses(lenses: Collection[str]) -> None:
+    """Refuse lenses, by the names of views, that pictures would have to be brought into, as they are written already.
+    Raises CaptureError: there is one."""
     if lenses:
         raise CaptureError(
             f"the lens of {name_some([*lenses])} is not found in the pictures, and its own is not one that scenes "
@@ -237,12 +224,21 @@ def _refuse_late(lenses: Collection[str]) -> None:
         )
 
 
-def _open_capture(options: ProcessOptions, references: GivenReferences) -> Capture:
+def _open_capture(options: ProcessOptions) -> tuple[GivenReferences, Capture]:
+    """The references that the user names, and the views, of which those of one sensor have the same size, bands, unit
+    and type of numbers. Raises CaptureError: they don't, or a file can't be read."""
+    mosaic, opened = parse_mosaic(options.mosaic), {}
+    for path, kind in ((options.dark, "dark"), (options.white, "white")):
+        if path is not None:
+            if not path.exists():
+                raise CaptureError(f"--{kind} {path}: no such file; give the image of the reference")
+            asked = ReadOptions(options.dataset, None, options.axes, mosaic=mosaic)
+            opened[kind] = open_spectral_file(path, asked)
+    references = GivenReferences(**opened)
     wavelengths = None if options.wavelengths is None else parse_wavelengths(options.wavelengths)
     named = tuple(path for file in references.files for path in file.files)
     if options.poses is not None:  # an array, perhaps
         named += (Path(options.poses), options.data / options.poses)
-    mosaic = parse_mosaic(options.mosaic)
     asked = ReadOptions(options.dataset, wavelengths, options.axes, mosaic=mosaic, exclude=named)
     capture = find_views(options.layout, options.data, asked)
 
@@ -267,51 +263,20 @@ def _open_capture(options: ProcessOptions, references: GivenReferences) -> Captu
         capture = with_mask_files(capture)
     first: dict[str, Cube] = {}
     for view in capture.views:
-        _refuse_unlike(view.cube, first.setdefault(view.sensor, view.cube))
-    return capture
-
-
-def _paths_read(options: ProcessOptions) -> list[tuple[str, Path]]:
-    """What the options name that is read, each with its flag."""
-    named = [("--data", options.data), ("--dark", options.dark), ("--white", options.white)]
-    named += [
-        (flag, Path(text))
-        for flag, text in (
-            ("--poses", options.poses),
-            ("--angles", options.angles),
-            ("--wavelengths", options.wavelengths),
-            ("--white-reflectance", options.white_reflectance),
-        )
-        if text is not None
-    ]
-    if options.poses is not None:
-        named.append(("--poses", options.data / options.poses))
-    return [(flag, path) for flag, path in named if path is not None and os.path.lexists(path)]
-
-
-def _open_references(options: ProcessOptions) -> GivenReferences:
-    opened: dict[str, Cube] = {}
-    for path, kind in ((options.dark, "dark"), (options.white, "white")):
-        if path is not None and not path.exists():
-            raise CaptureError(f"--{kind} {path}: no such file; give the image of the reference")
-        if path is not None:
-            asked = ReadOptions(options.dataset, None, options.axes, mosaic=parse_mosaic(options.mosaic))
-            opened[kind] = open_spectral_file(path, asked)
-    return GivenReferences(**opened)
-
-
-def _refuse_unlike(cube: Cube, first: Cube) -> None:
-    """Views of one sensor have the same size, bands, unit and type of numbers."""
-    if cube.shape != first.shape:
-        found, expected = (" x ".join(map(str, file.shape)) for file in (cube, first))
-        raise CaptureError(
-            f"{cube.path} has {found} rows, columns and bands; expected {expected}, as {first.path} has: crop it, or "
-            "remove it"
-        )
-    if (cube.bands.wavelengths_nm is None) != (first.bands.wavelengths_nm is None):
-        raise CaptureError(f"only one of {cube.path} and {first.path} gives wavelengths; give --wavelengths")
-    require_comparable(cube, first)
-    if cube.dtype.newbyteorder("=") != first.dtype.newbyteorder("="):
-        raise CaptureError(
-            f"{cube.path} holds {cube.dtype.name}; expected {first.dtype.name}, as {first.path} holds"
-        )
+        cube, other = view.cube, first.setdefault(view.sensor, view.cube)
+        if cube.shape != other.shape:
+            found, expected = (" x ".join(map(str, file.shape)) for file in (cube, other))
+            raise CaptureError(
+                f"{cube.path} has {found} rows, columns and bands; expected {expected}, as {other.path} has: crop it, "
+                "or remove it"
+            )
+        if (cube.bands.wavelengths_nm is None) != (other.bands.wavelengths_nm is None):
+            raise CaptureError(
+                f"only one of {cube.path} and {other.path} gives wavelengths; give --wavelengths"
+            )
+        require_comparable(cube, other)
+        if cube.dtype.newbyteorder("=") != other.dtype.newbyteorder("="):
+            raise CaptureError(
+                f"{cube.path} holds {cube.dtype.name}; expected {other.dtype.name}, as {other.path} holds"
+            )
+    return references, capture

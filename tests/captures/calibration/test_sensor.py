@@ -16,6 +16,7 @@ from unmix_plugin.captures.calibration.bands import (
     noise_shares,
     without_bad,
 )
+from unmix_plugin.captures.calibration.calibration import WhiteSample, count_stored, sampled_rows
 from unmix_plugin.captures.calibration.references import (
     GivenReferences,
     ReferenceKind,
@@ -27,7 +28,6 @@ from unmix_plugin.captures.decide import find_saturation, saturated_bands
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.plan import plan_sensor, with_one_exposure
 from unmix_plugin.captures.report import Code
-from unmix_plugin.captures.sample import WhiteSample, count_stored, sampled_rows
 
 WAVELENGTHS_NM = np.linspace(400.0, 900.0, 12)
 NAMED = DroppedBand(BandFault.NAMED)

@@ -1,31 +1,47 @@
-"""From stored numbers to values: cropping, dark frame, white reference, exposure, binning.
+"""From stored numbers to values: cropping, dark frame, white reference, exposure, binning; and the samples of views, as
+they are stored and once calibrated, that all decisions on values are taken from.
 
     value = (stored - dark) / (white - dark) * reflectance of the panel * exposure of white / exposure of view
 
 with what is not given left out. A white may have a dark frame of its own.
 
 Notation: `H x W` pixels and `B` bands of the file, of which `h` rows and `b` bands are read; `n x w` pixels and `c`
-bands of the result. Of exposures, `b` is 1, or the bands of a file.
+bands of the result. Of exposures, `b` is 1, or the bands of a file. Of samples, `P` and `N` are pixels, `W` those of a
+row, and `K` stored numbers that a type can hold.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, UInt8
+from jaxtyping import Bool, Float32, Float64, Int64, Shaped, UInt8
 
 from unmix_plugin.captures.calibration.exposures import exposure_of
 from unmix_plugin.captures.calibration.references import (
+    Reference,
     SensorReferences,
-    find_missing,
     refuse_outside,
     stated_values,
 )
-from unmix_plugin.captures.cube import Cube
+from unmix_plugin.captures.cube import BandIndex, CaptureView, Cube, find_missing
 from unmix_plugin.captures.poses.lens import Lens
+from unmix_plugin.captures.spoilt import ViewPixels
 from unmix_plugin.errors import ConfigError
+
+BRIGHT_PERCENTILE = 99.9
+_ROWS_A_VIEW = 12
+_MOST_ALIKE = 4
+"""Views that are looked at for bands with one value only."""
+_MOST_PIXELS = 20000
+"""Of all views together."""
+_BORDER_SHARE = 0.02
+"""Width of the border that a background is judged by, as a share of the view's."""
+_MOST_BORDER_PIXELS = 20000
+_BACKDROP_ROWS = 96
+"""Of a view in which a backdrop is looked for."""
 
 
 @dataclass(frozen=True)
@@ -154,7 +170,24 @@ class Calibration:
         stored = whole[:, columns]
         missing = find_missing(whole, file, rows, self.bands)[:, columns]
         saturated = np.zeros(stored.shape, bool) if self.saturation is None else stored >= self.saturation
-        values = self._values(file, whole, rows)
+        values = stated_values(file, whole, rows, self.bands)[:, columns]  # a new array, free to be changed
+        used = self.references.of(file)
+        dark, white = used.dark, used.white
+        if dark is not None:
+            values -= dark.rows(rows, columns, self.bands)
+        factor, wanted, found = np.ones(1, np.float32), self.exposure, exposure_of(file)
+        if file.path in self.references.by_view and white is not None and wanted is not None:
+            wanted = exposure_of(white.file)  # its own white reference
+        if wanted is not None and found is not None:
+            ratio = (wanted / found).astype(np.float32)
+            factor = ratio if len(ratio) == 1 else ratio[self.bands]
+        if white is not None:
+            assert white.reflectance is not None
+            light = white.light(rows, columns, self.bands)
+            # NaN where the white is not above the dark.
+            light = np.where(light > 0, light, np.float32(np.nan))
+            factor = factor * (white.reflectance[self.bands].astype(np.float32) / light)
+        values *= factor
         sound = np.isfinite(values.sum(axis=-1)) & ~missing  # one number that is not finite makes the sum so
         if not sound.all():
             values[~sound] = 0.0
@@ -165,34 +198,158 @@ class Calibration:
             saturated &= part == 255
         values, saturated = self.raster.averaged(values), self.raster.mostly_in_square(saturated)
         if self.bin_bands > 1:
-            values = self._in_bins(values).mean(axis=-1)
-            saturated = np.any(self._in_bins(saturated), axis=-1)
+            in_bins = (*values.shape[:-1], self.num_bands, self.bin_bands)
+            values = values.reshape(in_bins).mean(axis=-1)
+            saturated = np.any(saturated.reshape(in_bins), axis=-1)
         missing = self.raster.any_in_square(~sound)
         values[missing] = 0.0
         return CalibratedRows(values.astype(np.float32, copy=False), saturated, missing)
 
-    def _values(self, file: Cube, whole: np.ndarray, rows: slice) -> Float32[np.ndarray, "h W b"]:
-        columns, bands = self.raster.columns, self.bands
-        values = stated_values(file, whole, rows, bands)[:, columns]  # a new array, free to be changed
-        used = self.references.of(file)
-        dark, white = used.dark, used.white
-        if dark is not None:
-            values -= dark.rows(rows, columns, bands)
-        factor, wanted, found = np.ones(1, np.float32), self.exposure, exposure_of(file)
-        if file.path in self.references.by_view and white is not None and wanted is not None:
-            wanted = exposure_of(white.file)  # its own white reference
-        if wanted is not None and found is not None:
-            ratio = (wanted / found).astype(np.float32)
-            factor = ratio if len(ratio) == 1 else ratio[bands]
-        if white is not None:
-            assert white.reflectance is not None
-            light = white.light(rows, columns, bands)
-            # NaN where the white is not above the dark.
-            light = np.where(light > 0, light, np.float32(np.nan))
-            factor = factor * (white.reflectance[bands].astype(np.float32) / light)
-        values *= factor
-        return values
 
-    def _in_bins(self, values: np.ndarray) -> np.ndarray:
-        """Kept bands by bins, (n, w, b) to (n, w, c, bands of a bin)."""
-        return values.reshape(*values.shape[:-1], self.num_bands, self.bin_bands)
+# Samples: a few rows of every view.
+
+
+def sampled_rows(height: int) -> list[int]:
+    """Rows spread evenly over an image."""
+    count = min(height, _ROWS_A_VIEW)
+    return [int((index + 0.5) * height / count) for index in range(count)]
+
+
+# As stored: where does the detector end, and can values be reflectances?
+
+
+@dataclass(frozen=True)
+class StoredCounts:
+    """How often each stored number is there in sampled rows of all views, in bands that have more than one value."""
+
+    dtype: np.dtype
+    lowest: int
+    """Number of the first count."""
+    counts: Int64[np.ndarray, " K"]
+    num_pixels: int
+    """With a measurement, in the first views."""
+    num_bands: int
+    """With more than one value in these."""
+    are_whole: bool = True
+    """Whether all numbers are whole ones that are counted; nothing was counted otherwise."""
+
+    @property
+    def is_wide(self) -> bool:
+        """Whether the type holds more than a detector gives: its numbers are of one, or processed."""
+        return self.dtype.kind not in "iu" or self.dtype.itemsize > 2
+
+    @property
+    def highest(self) -> int:
+        """Number of the last count."""
+        return self.lowest + len(self.counts) - 1
+
+
+def count_stored(files: Sequence[Cube], bands: np.ndarray) -> StoredCounts:
+    """Count the stored numbers of these bands; of wide types, those of 16 bits."""
+    dtype = files[0].dtype
+    is_wide = dtype.kind not in "iu" or dtype.itemsize > 2
+    limits = np.iinfo(np.uint16 if is_wide else dtype)
+    low, high = int(limits.min), int(limits.max)
+    counts = np.zeros(high - low + 1, dtype=np.int64)
+    rows = sampled_rows(files[0].shape[0])
+    known = np.concatenate(
+        [_stored_pixels(file, row, bands) for file, row in product(files[:_MOST_ALIKE], rows)]
+    )
+    varying = bands[np.ptp(known, axis=0) > 0] if len(known) else bands[:0]
+    for file, row in product(files, rows) if len(varying) else ():
+        stored = _stored_pixels(file, row, varying).ravel()
+        if is_wide and not ((stored >= 0) & (stored <= high) & (stored % 1 == 0)).all():
+            return StoredCounts(dtype, low, counts, len(known), len(varying), are_whole=False)
+        counts += np.bincount(stored.astype(np.int64) - low, minlength=len(counts))
+    return StoredCounts(dtype, low, counts, len(known), len(varying))
+
+
+def bright_values(files: Sequence[Cube]) -> list[float]:
+    """Values of bright pixels of some files, as these state them, before any reference."""
+    bright = []
+    for index in np.unique(np.linspace(0, len(files) - 1, min(len(files), _MOST_ALIKE + 1)).astype(int)):
+        file = files[index]
+        parts = [
+            (_stored_pixels(file, row)[None], slice(row, row + 1)) for row in sampled_rows(file.shape[0])
+        ]
+        values = np.concatenate([stated_values(file, *part).ravel() for part in parts])
+        bright += [float(np.percentile(values, BRIGHT_PERCENTILE))] if len(values) else []
+    return bright
+
+
+def _stored_pixels(file: Cube, row: int, bands: BandIndex = slice(None)) -> Shaped[np.ndarray, "P b"]:
+    """Stored numbers of the pixels of a row that have a measurement."""
+    stored = file.read(slice(row, row + 1), bands)
+    return stored[~find_missing(stored, file, slice(row, row + 1), bands)]
+
+
+@dataclass(frozen=True)
+class WhiteSample:
+    """Some rows of the panel of a white reference."""
+
+    stored: Shaped[np.ndarray, "n columns B"]
+    is_measured: Bool[np.ndarray, "n columns"]
+
+    @staticmethod
+    def of(white: Reference) -> WhiteSample:
+        """Rows of its file, or of the rectangle that shows it."""
+        top, left, height, width = white.rectangle or (0, 0, *white.file.shape[:2])
+        columns, read, measured = slice(left, left + width), [], []
+        for row in sampled_rows(height):
+            line = slice(top + row, top + row + 1)
+            numbers = white.file.read(line)
+            read.append(numbers[:, columns])
+            measured.append(~find_missing(numbers, white.file, line)[:, columns])
+        return WhiteSample(np.concatenate(read), np.concatenate(measured))
+
+
+# As calibrated: pixels of all views, of their borders, and of views that may show a backdrop.
+def draw_pixels(views: Sequence[CaptureView], calibration: Calibration) -> list[ViewPixels]:
+    """Pixels on the sampled rows of each view, evenly spaced along them, at all bands that the calibration keeps."""
+    raster = calibration.raster
+    rows = sampled_rows(raster.height)
+    step = max(1, len(views) * len(rows) * raster.width // _MOST_PIXELS)
+    drawn = []
+    for view in views:
+        parts = [calibration.rows(view.cube, row, row + 1) for row in rows]
+        kept = np.zeros((len(rows), raster.width), bool)
+        for index, row in enumerate(rows):
+            kept[index, row % step :: step] = True
+        kept &= ~np.concatenate([part.missing for part in parts])
+        values, saturated = (
+            np.concatenate([getattr(part, name) for part in parts])[kept] for name in ("values", "saturated")
+        )
+        drawn.append(ViewPixels(view.name, values, saturated))
+    return drawn
+
+
+def border_pixels(
+    views: Sequence[CaptureView], calibration: Calibration, scale: float
+) -> Float32[np.ndarray, "P c"]:
+    """Pixels at the border of the views, in [0, 1]; saturated ones are 1, missing ones are left out."""
+    raster = calibration.raster
+    width = max(1, round(_BORDER_SHARE * raster.width))
+    columns = np.r_[0:width, raster.width - width : raster.width]
+    rows = sorted({0, raster.height - 1, *sampled_rows(raster.height)})
+    step = max(1, len(views) * (2 * raster.width + 2 * width * len(rows)) // _MOST_BORDER_PIXELS)
+    border = []
+    for view in views:
+        for row in rows:
+            part = calibration.rows(view.cube, row, row + 1)
+            shown = np.arange(raster.width) if row in (0, raster.height - 1) else columns
+            shown = shown[row % step :: step]
+            values = np.where(part.saturated[0, shown], np.float32(scale), part.values[0, shown])
+            border.append(values[~part.missing[0, shown]])
+    return np.clip(np.concatenate(border) / np.float32(scale), 0.0, 1.0)
+
+
+def rows_behind(
+    view: CaptureView, calibration: Calibration, scale: float
+) -> tuple[Float32[np.ndarray, "n W c"], Bool[np.ndarray, "n W"]]:
+    """Rows of a view that may show a backdrop, in [0, 1], and which of their pixels were measured."""
+    height = calibration.raster.height
+    rows = np.unique(np.linspace(0, height - 1, min(height, _BACKDROP_ROWS)).astype(int))
+    parts = [calibration.rows(view.cube, row, row + 1) for row in rows.tolist()]
+    values = np.concatenate([np.where(part.saturated, np.float32(scale), part.values) for part in parts])
+    seen = np.clip(values / np.float32(scale), 0.0, 1.0)
+    return seen, ~np.concatenate([part.missing for part in parts])

@@ -12,14 +12,19 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int
 
 from unmix_plugin.captures.calibration.bands import BandChoice, without_unlit
-from unmix_plugin.captures.calibration.calibration import Calibration, Raster
+from unmix_plugin.captures.calibration.calibration import (
+    Calibration,
+    Raster,
+    WhiteSample,
+    bright_values,
+    count_stored,
+)
 from unmix_plugin.captures.calibration.exposures import ExposedFiles, compare_exposures
 from unmix_plugin.captures.calibration.references import GivenReferences, SensorReferences, find_references
 from unmix_plugin.captures.cube import CaptureView, Cube, Meaning, find_missing
 from unmix_plugin.captures.decide import find_saturation, may_be_reflectance, saturated_bands
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.report import Kind, sentences
-from unmix_plugin.captures.sample import WhiteSample, bright_values, count_stored
 from unmix_plugin.captures.writing.view_files import read_view_masks
 from unmix_plugin.errors import CaptureError, ConfigError, counted
 

@@ -14,11 +14,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64, UInt8
+from jaxtyping import UInt8
 
 from unmix_plugin import __version__
 from unmix_plugin.captures.calibration.bands import BandFault
-from unmix_plugin.captures.checks import SeenView, angles_between, check_views
+from unmix_plugin.captures.checks import (
+    SeenView,
+    ViewSample,
+    angles_between,
+    check_files,
+    check_values,
+    check_views,
+)
 from unmix_plugin.captures.cube import CaptureView
 from unmix_plugin.captures.match_checks import MatchedScene, check_matches
 from unmix_plugin.captures.options import ProcessOptions, plain_options
@@ -27,7 +34,6 @@ from unmix_plugin.captures.poses.line_motion import averaged_lines, middle_of
 from unmix_plugin.captures.poses.pose_set import PoseSet
 from unmix_plugin.captures.posing import PosedViews
 from unmix_plugin.captures.report import Kind, Remark, report_text, sentences
-from unmix_plugin.captures.value_checks import ViewSample, check_files, check_values
 from unmix_plugin.captures.writing.view_files import FULL_SCALE, BackgroundRule, ViewRecord
 from unmix_plugin.captures.writing.work_folder import RECORD_NAME, hashes
 from unmix_plugin.engine.decisions import Decision
@@ -38,7 +44,6 @@ from unmix_plugin.errors import counted, name_some
 from unmix_plugin.figures.pictures import Canvas, CanvasLayout, columns_for
 from unmix_plugin.figures.plotting import FIGURE_DPI, figure_bytes, plain_axes
 from unmix_plugin.formats.meshes import write_ply
-from unmix_plugin.scenes.backdrops import Backdrop
 from unmix_plugin.scenes.folder import lens_keys, matrix_entry, transforms_bytes
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
@@ -106,7 +111,21 @@ def write_scene_files(
     Raises:
         RunError: the folder can't be written.
     """
-    keys = posed.keys | write_points(folder, posed.poses) | _write_light(folder, plan)
+    keys = posed.keys | write_points(folder, posed.poses)
+    # Reflectances are seen in a flat light. Where they were divided by a scale, a perfect white is stored as 1 over it,
+    # which readers make the power of this light: whatever is divided by it is reflectance again. Where nobody says what
+    # 1 is, values that had to be divided may be per cent, or anything.
+    first, *others = sensors = list(plan.sensors.values())
+    meanings, scale = [sensor.meaning for sensor in sensors], plan.scale.value
+    if all(one.is_reflectance and (one.states_one or scale == 1.0) for one in meanings):
+        if first.lamp is not None and all(np.array_equal(first.centers_nm, one.centers_nm) for one in others):
+            lamp = SpectraTable(Bands(first.centers_nm), ("power",), first.lamp[None])
+            write_spectra_csv(folder / _ILLUMINANT_NAME, lamp)
+        bands = Bands(np.unique(np.concatenate([sensor.centers_nm for sensor in sensors])))
+        flat = SpectraTable(bands, ("power",), np.ones((1, len(bands))))
+        write_spectra_csv(folder / _FLAT_LIGHT_NAME, flat)
+        keys["illuminant_path"] = _FLAT_LIGHT_NAME
+        keys |= {} if scale == 1.0 else {"reflectance_of_1": scale}
     seen = seen_views(folder, plan, posed, records)
     # Views of sensors with other bands can't be compared with those of the one that took the most.
     bands_nm = plan.sensors[_greatest_sensor(seen)].centers_nm
@@ -122,7 +141,12 @@ def write_scene_files(
     findings += sentences(checked, Kind.WRONG)
     measured = [*sentences(checked, Kind.MEASURED), check_matches(matched, findings)]
 
-    title = f"{plan.capture.root}: {len(seen)} views, {_sizes_in_words(plan)}"
+    sizes = []
+    for name, sensor in plan.sensors.items():
+        raster, centers = sensor.calibration.raster, sensor.centers_nm
+        bands = f"1 band at {centers[0]:g} nm" if len(centers) == 1 else str(Bands(centers))
+        sizes.append(f"{name + ': ' if name else ''}{raster.height} x {raster.width} pixels, {bands}")
+    title = f"{plan.capture.root}: {len(seen)} views, {'; '.join(sizes)}"
     done = sentences(left_out, Kind.DONE) + _what_was_done(plan, posed, [view.record for view in seen])
     report = report_text(title, findings, measured, done, decided)
     write_file(folder / _REPORT_NAME, terminal_text(report).encode())
@@ -148,15 +172,11 @@ def write_scene_files(
     }
     write_file(folder / RECORD_NAME, transforms_bytes(record))
 
-    named = {name: remark.code.name.lower().replace("_", " ") for name, remark in reasons.items()}
-    others = [
-        {
-            "name": name,
-            "reason": reason.removeprefix("view "),
-            **(records[name].paths if name in records else {}),
-        }
-        for name, reason in named.items()
-    ]
+    others = []
+    for name, remark in reasons.items():
+        reason = remark.code.name.lower().replace("_", " ").removeprefix("view ")
+        paths = records[name].paths if name in records else {}
+        others.append({"name": name, "reason": reason, **paths})
     keys |= {"left_out": others} if others else {}
     markers = {name: corners.tolist() for name, corners in posed.poses.markers.items()}
     keys |= {"markers": markers} if markers else {}
@@ -176,26 +196,6 @@ def write_points(folder: Path, poses: PoseSet) -> dict[str, str]:
     return {"ply_file_path": _POINTS_NAME}
 
 
-def _write_light(folder: Path, plan: Plan) -> dict[str, Any]:
-    """The light on the white panel, for people, and the flat one in which reflectances are seen; keys of the scene.
-
-    Where reflectances were divided by a scale, a perfect white is stored as 1 over it, which readers make the power of
-    this light: whatever is divided by it is reflectance again.
-    """
-    first, *others = sensors = list(plan.sensors.values())
-    # Where nobody says what 1 is, values that had to be divided may be per cent, or anything.
-    meanings = [sensor.meaning for sensor in sensors]
-    if not all(one.is_reflectance and (one.states_one or plan.scale.value == 1.0) for one in meanings):
-        return {}
-    if first.lamp is not None and all(np.array_equal(first.centers_nm, one.centers_nm) for one in others):
-        lamp = SpectraTable(Bands(first.centers_nm), ("power",), first.lamp[None])
-        write_spectra_csv(folder / _ILLUMINANT_NAME, lamp)
-    bands = Bands(np.unique(np.concatenate([sensor.centers_nm for sensor in sensors])))
-    write_spectra_csv(folder / _FLAT_LIGHT_NAME, SpectraTable(bands, ("power",), np.ones((1, len(bands)))))
-    divided = {} if plan.scale.value == 1.0 else {"reflectance_of_1": plan.scale.value}
-    return {"illuminant_path": _FLAT_LIGHT_NAME, **divided}
-
-
 def _transforms_json(
     plan: Plan, views: Sequence[CaptureView], seen: Sequence[SeenView], extra: dict[str, Any]
 ) -> dict[str, Any]:
@@ -205,7 +205,16 @@ def _transforms_json(
     the name of their sensor.
     """
     bands = np.unique(np.concatenate([plan.sensors[view.sensor].centers_nm for view in views]))
-    facts = [_facts(plan, view, written, bands) for view, written in zip(views, seen, strict=True)]
+    facts = []  # keys of a frame that it may share with the others
+    for view, written in zip(views, seen, strict=True):
+        lens, centers_nm = written.camera.lens, plan.sensors[view.sensor].centers_nm
+        assert lens is not None
+        known: dict[str, Any] = {"w": lens.width, "h": lens.height}
+        known |= lens_keys(lens.focal_px, lens.center_px, (*lens.distortion, *lens.higher_radial))
+        known |= {key: text for key, text in (("sensor", view.sensor), ("capture", view.shot)) if text}
+        if len(centers_nm) < len(bands):
+            known["bands"] = np.searchsorted(bands, centers_nm).tolist()
+        facts.append(known)
     shared = {
         key: value for key, value in facts[0].items() if all(of_frame.get(key) == value for of_frame in facts)
     }
@@ -247,33 +256,6 @@ def _transforms_json(
     }
 
 
-def _facts(
-    plan: Plan, view: CaptureView, written: SeenView, bands: Float64[np.ndarray, " B"]
-) -> dict[str, Any]:
-    """Keys of a frame that it may share with the others."""
-    lens, centers_nm = written.camera.lens, plan.sensors[view.sensor].centers_nm
-    assert lens is not None
-    facts: dict[str, Any] = {"w": lens.width, "h": lens.height}
-    facts |= lens_keys(lens.focal_px, lens.center_px, (*lens.distortion, *lens.higher_radial))
-    if view.sensor:
-        facts["sensor"] = view.sensor
-    if view.shot:
-        facts["capture"] = view.shot
-    if len(centers_nm) < len(bands):
-        facts["bands"] = np.searchsorted(bands, centers_nm).tolist()
-    return facts
-
-
-def _sizes_in_words(plan: Plan) -> str:
-    """Pixels and bands of each sensor."""
-    found = []
-    for name, sensor in plan.sensors.items():
-        raster, centers = sensor.calibration.raster, sensor.centers_nm
-        bands = f"1 band at {centers[0]:g} nm" if len(centers) == 1 else str(Bands(centers))
-        found.append(f"{name + ': ' if name else ''}{raster.height} x {raster.width} pixels, {bands}")
-    return "; ".join(found)
-
-
 def _what_was_done(plan: Plan, posed: PosedViews, views: Sequence[ViewRecord]) -> list[str]:
     """Decisions and totals, one sentence each."""
     lines = []
@@ -310,12 +292,12 @@ def _what_was_done(plan: Plan, posed: PosedViews, views: Sequence[ViewRecord]) -
         f"{total('missing_pixels')} masked, as nothing was measured there"
     )
     share = f"{np.mean([view.matter_share for view in views]):.0%} of the pixels are foreground"
-    found = [recipe.background for recipe in plan.recipes.values() if isinstance(recipe.background, Backdrop)]
+    found = plan.backdrops_in_words
     changed = f"{total('specks')} removed, {total('holes')} filled"
     if found:
         whole = sum(view.matter_share == 1.0 for view in views)
         lines.append(
-            f"backdrop found, {', '.join(each.in_words for each in found)}: {share}, the rest is cut out with soft "
+            f"backdrop found, {found}: {share}, the rest is cut out with soft "
             f"edges; {changed}" + (f"; {counted(whole, 'view')} without any of it" if whole else "")
         )
     elif plan.mask == "none":
@@ -356,7 +338,24 @@ def contact_sheet(
     stand last, framed in red."""
     from matplotlib.figure import Figure
 
-    tiles = _tiles(views, left_out)
+    root = views[0].picture.parent.parent
+    shown = [views[index] for index in evenly_spaced(len(views), _MOST_VIEWS)]
+    side_px = int(np.clip(_SHEET_PX / columns_for(len(shown) + len(left_out)), *_TILE_PX))
+    files = [(view.picture, view.record) for view in shown]
+    files += [(root / record.paths["file_path"], record) for record in left_out]
+    pictures = [_small_picture(picture, record, side_px) for picture, record in files]
+    for picture in pictures[len(shown) :]:
+        for rim in (picture[:_RIM_PX], picture[-_RIM_PX:], picture[:, :_RIM_PX], picture[:, -_RIM_PX:]):
+            rim[:] = _IGNORED
+    size = max(picture.shape[1] for picture in pictures), max(picture.shape[0] for picture in pictures)
+    captions = [view.name for view in shown] + [f"{record.name} (left out)" for record in left_out]
+    layout = CanvasLayout.of(size, captions)
+    canvas = Canvas(layout, 3, captions)
+    for index, picture in enumerate(pictures):
+        row, column = layout.corner(index)
+        canvas.pixels[row : row + picture.shape[0], column : column + picture.shape[1]] = picture
+
+    tiles = canvas.pixels
     height, width = (length / FIGURE_DPI for length in tiles.shape[:2])
     page_width = max(width + 0.4, _LEAST_WIDTH_INCHES)
     lines = textwrap.wrap(heading, int(page_width * _LETTERS_AN_INCH))
@@ -381,26 +380,6 @@ def contact_sheet(
     _draw_cameras(panels[1], views, poses, (0, 2), "from the side")
     _draw_spectra(panels[2], views, sensors)
     return figure_bytes(figure)
-
-
-def _tiles(views: Sequence[SeenView], left_out: Sequence[ViewRecord]) -> UInt8[np.ndarray, "H W 3"]:
-    root = views[0].picture.parent.parent
-    shown = [views[index] for index in evenly_spaced(len(views), _MOST_VIEWS)]
-    side_px = int(np.clip(_SHEET_PX / columns_for(len(shown) + len(left_out)), *_TILE_PX))
-    files = [(view.picture, view.record) for view in shown]
-    files += [(root / record.paths["file_path"], record) for record in left_out]
-    pictures = [_small_picture(picture, record, side_px) for picture, record in files]
-    for picture in pictures[len(shown) :]:
-        for rim in (picture[:_RIM_PX], picture[-_RIM_PX:], picture[:, :_RIM_PX], picture[:, -_RIM_PX:]):
-            rim[:] = _IGNORED
-    size = max(picture.shape[1] for picture in pictures), max(picture.shape[0] for picture in pictures)
-    captions = [view.name for view in shown] + [f"{record.name} (left out)" for record in left_out]
-    layout = CanvasLayout.of(size, captions)
-    canvas = Canvas(layout, 3, captions)
-    for index, picture in enumerate(pictures):
-        row, column = layout.corner(index)
-        canvas.pixels[row : row + picture.shape[0], column : column + picture.shape[1]] = picture
-    return canvas.pixels
 
 
 def _small_picture(picture_file: Path, record: ViewRecord, side_px: int) -> UInt8[np.ndarray, "h w 3"]:

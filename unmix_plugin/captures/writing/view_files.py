@@ -355,7 +355,16 @@ def read_view_masks(view: CaptureView, raster: Raster, use_opacity: bool) -> Vie
         CaptureError: a file can't be read or has another size than the cube.
     """
     valid, opacity, straight = np.ones((raster.height, raster.width), bool), None, None
-    alpha = _alpha(view) if use_opacity else None
+    alpha = None
+    if use_opacity and view.alpha is not None:
+        if view.alpha.shape[:2] != view.cube.shape[:2]:
+            raise CaptureError(
+                f"{view.alpha.path} has {view.alpha.shape[0]} x {view.alpha.shape[1]} pixels; expected "
+                f"{view.cube.shape[0]} x {view.cube.shape[1]}, as the cube has"
+            )
+        alpha = np.rint(np.clip(view.alpha.read()[..., 0], 0.0, 1.0) * OPAQUE).astype(np.uint8)
+    elif use_opacity and (picture := alpha_picture(view)) is not None:
+        alpha = _read(picture, lambda image: np.asarray(image.convert("RGBA"))[..., 3], view)
     if alpha is not None:
         of_file = alpha[raster.pixels]
         opacity = np.rint(raster.averaged(of_file.astype(np.float32))).astype(np.uint8)
@@ -386,19 +395,6 @@ def read_labels(view: CaptureView, raster: Raster) -> UInt8[np.ndarray, "H W"] |
     first = labels[::side, ::side]
     mixed = raster.any_in_square(labels != first.repeat(side, axis=0).repeat(side, axis=1))
     return np.where(mixed, np.uint8(UNLABELLED), first)
-
-
-def _alpha(view: CaptureView) -> UInt8[np.ndarray, "H W"] | None:
-    if view.alpha is not None:
-        if view.alpha.shape[:2] != view.cube.shape[:2]:
-            raise CaptureError(
-                f"{view.alpha.path} has {view.alpha.shape[0]} x {view.alpha.shape[1]} pixels; expected "
-                f"{view.cube.shape[0]} x {view.cube.shape[1]}, as the cube has"
-            )
-        return np.rint(np.clip(view.alpha.read()[..., 0], 0.0, 1.0) * OPAQUE).astype(np.uint8)
-    if (picture := alpha_picture(view)) is None:
-        return None
-    return _read(picture, lambda image: np.asarray(image.convert("RGBA"))[..., 3], view)
 
 
 def alpha_picture(view: CaptureView) -> Path | None:
