@@ -74,19 +74,21 @@ def find_bounds(cameras: Cameras, foreground: Masks | None, points: MatchedPoint
     centre, half = _cube_of_views(cameras)
     if foreground is None:
         box = _box(centre - half, centre + half)
-        is_shared = _count_views(cameras, box, _SEEN_CELLS) >= _SEEN_SHARE * len(cameras)
+        everywhere = np.ones((_SEEN_CELLS,) * 3, dtype=bool)
+        is_shared = _count_views(cameras, box, everywhere) >= _SEEN_SHARE * len(cameras)
         return _extent(box, is_shared, margin_cells=0) if is_shared.any() else box
     rays = foreground_rays(cameras, foreground)
     box = _box(centre - _HULL_START * half, centre + _HULL_START * half)
     hull = carve_box(cameras, foreground, box, _HULL_CELLS)
     # Near a camera that looks out of the others' images everything is consistent, so only shared places count.
-    count = _count_views(cameras, box, _HULL_CELLS)
+    count = _count_views(cameras, box, hull)
     explained = share_through(rays, box, hull & (count >= _HULL_SHARES[0] * count.max()))
     if explained < _MIN_CONSISTENT:
         raise SceneError(Message.ALPHA_AND_POSES.sentence(share=explained))
-    box = _tighten(cameras, rays, box, hull)
-    # The second look has finer cells and so a thinner margin.
-    return _tighten(cameras, rays, box, carve_box(cameras, foreground, box, _HULL_CELLS))
+    box = _tight(box, hull, count, rays)
+    # The second look has finer cells and so a thinner margin. It may find that nothing fits after all.
+    hull = carve_box(cameras, foreground, box, _HULL_CELLS)
+    return _tight(box, hull, _count_views(cameras, box, hull), rays) if hull.any() else box
 
 
 def _box_of_places(cameras: Cameras, points: MatchedPoints) -> SceneBox:
@@ -132,14 +134,11 @@ def _cube_of_views(cameras: Cameras) -> tuple[Float64[np.ndarray, "3"], float]:
     return middle + direction / length * depth, half
 
 
-def _tighten(cameras: Cameras, rays: RayBundle, box: SceneBox, hull: Cells) -> SceneBox:
+def _tight(box: SceneBox, hull: Cells, count: Int64[np.ndarray, "R R R"], rays: RayBundle) -> SceneBox:
     """The extent of the hull in a box, without its far ends that few cameras see, if the images allow.
 
     Where views are cropped the hull has long arms that reach from the subject to the edge of what is seen.
     """
-    if not hull.any():  # finer cells may find that nothing fits after all
-        return box
-    count = _count_views(cameras, box, _HULL_CELLS, hull)
     for share in _HULL_SHARES:
         tight = _extent(box, hull & (count >= share * count.max()), margin_cells=1)
         t_near, t_far = tight.intersect(rays.origins, rays.directions)
@@ -148,12 +147,9 @@ def _tighten(cameras: Cameras, rays: RayBundle, box: SceneBox, hull: Cells) -> S
     return _extent(box, hull, margin_cells=1)
 
 
-def _count_views(
-    cameras: Cameras, box: SceneBox, cells: int, among: Cells | None = None
-) -> Int64[np.ndarray, "R R R"]:
-    """How many cameras see the centre of each cell, of the cells `among` all; 0 for others."""
-    asked = np.ones((cells, cells, cells), dtype=bool) if among is None else among
-    points = box.aabb[0] + unit_centres(cells)[torch.from_numpy(asked).flatten()] * box.size
+def _count_views(cameras: Cameras, box: SceneBox, asked: Cells) -> Int64[np.ndarray, "R R R"]:
+    """How many cameras see the centre of each cell that is asked for; 0 for others."""
+    points = box.aabb[0] + unit_centres(len(asked))[torch.from_numpy(asked).flatten()] * box.size
     count = np.zeros(asked.shape, dtype=np.int64)
     count[asked] = count_views(cameras, points).numpy()
     return count

