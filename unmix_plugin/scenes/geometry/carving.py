@@ -326,10 +326,17 @@ def share_through(rays: RayBundle, box: SceneBox, hull: Cells) -> float:
 
 
 def _without_specks(foreground: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
-    """Foreground that has neighbours: single pixels in the air need no hull behind them."""
-    from scipy.ndimage import binary_opening  # slow to import, and most commands carve nothing
+    """Foreground in squares of 2 x 2 pixels: single pixels in the air need no hull behind them.
 
-    return binary_opening(foreground, np.ones((2, 2), dtype=bool))
+    As `scipy.ndimage.binary_opening`, whose import takes half a second.
+    """
+    pairs = foreground[:-1] & foreground[1:]
+    squares = pairs[:, :-1] & pairs[:, 1:]
+    opened = np.zeros_like(foreground)
+    for rows in (slice(None, -1), slice(1, None)):
+        for columns in (slice(None, -1), slice(1, None)):
+            opened[rows, columns] |= squares
+    return opened
 
 
 def _carve_world(cameras: Cameras, box: SceneBox, resolution: int) -> Cells:
