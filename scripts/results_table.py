@@ -41,7 +41,7 @@ def introduction(report: dict[str, Any]) -> str:
     lines = (
         f"Evaluation views of {len(measured)} rendered scenes after {limit} of training on two shared CPU cores.",
         "Only the number of endmembers was set ([all figures](benchmarks/results/quality.md)).",
-        "Settings were never chosen on drawn scenes. `make results-table` measures again, from a clone alone.",
+        "No setting was chosen on drawn scenes. `make results-table` measures again, from a clone alone.",
     )
     return "\n".join([*lines, ""])
 
