@@ -17,7 +17,7 @@ from unmix_plugin.sensors.views import from_batch
 def naive_spectra(model: UnmixModel, rays) -> torch.Tensor:
     """The paper's sum: a spectrum of B bands at every sample, composited ray by ray."""
     samples = model.renderer.march(rays.origins, rays.directions, torch.zeros(len(rays))).samples()
-    positions, along = points_of(samples, rays)
+    positions, along = points_of(rays, samples.ray_indices, samples.t)
     densities, features = model.field.get_density(positions)
     outputs = model.field.get_outputs(positions, along, features)
     per_sample = torch.einsum("sk,kb->sb", outputs["scaled_abundances"], model.endmembers)

@@ -5,6 +5,11 @@ small network give density and features g(x); heads on g give abundances a = sof
 specular coefficients in (0, 8) that already carry the tint h.
 
 Source: Perez et al. 2025, UnMix-NeRF, section 3; the coefficients replace the paper's spectra a sample, see model.py.
+
+`PublishedField` is as the paper and its authors' code have it, for the method `unmix-nerf-published`: with a positional
+encoding PE of the point beside g, one network gives abundances and the tint h, another a scale for each endmember in
+(0, 1), and the view-dependent spectrum, one value a band (J = B), sees direction and PE only.
+docs/background/method.md lists what still differs.
 """
 
 from __future__ import annotations
@@ -27,7 +32,6 @@ from unmix_plugin.light.shading import (
     NUM_SKY_FEATURES,
     Lamplight,
     LampShading,
-    LitSurface,
     backdrop_features,
     bias_free_network,
     direction_features,
@@ -114,23 +118,36 @@ class FieldSpace:
     """Whether the grid's levels have weights, as refining poses needs them."""
 
 
+_NUM_FREQUENCIES = 2
+_NUM_POSITION_FEATURES = 3 * 2 * _NUM_FREQUENCIES
+
+
 class GridField(CoefficientField):
-    """Densities and geometry features of points from a hash grid, and what is behind all of them.
+    """Densities and geometry features of points from a hash grid, and what is behind all of them; a kind of field adds
+    heads, which lie between: random numbers are drawn for grid, heads and sky in this order."""
 
-    The heads of a kind of field lie between: random numbers are drawn for grid, heads and sky in this order.
-    """
-
-    aabb: Tensor
+    origin: Tensor
+    edge: Tensor
+    """What is 0, and what is 1, of the coordinates that the hash grid takes, or that are contracted first."""
     level_weights: Tensor | None
     """(L), by which the grid's levels are multiplied; None where all count alike."""
 
-    def __init__(self, config: UnmixFieldConfig, space: FieldSpace, num_endmembers: int) -> None:
+    def __init__(
+        self,
+        config: UnmixFieldConfig,
+        space: FieldSpace,
+        num_endmembers: int,
+        *,
+        sees_positions: bool = False,
+    ) -> None:
         """
         Args:
             config: Sizes.
             num_endmembers: K.
+            sees_positions: Whether features have PE beside g, and not the number that density is made of.
         """
         super().__init__()
+        self.sees_positions = sees_positions
         self.config, self.num_endmembers = config, num_endmembers
         self.is_unbounded, self._has_backdrop = space.is_unbounded, space.has_backdrop
         self.num_encoded = config.num_levels * config.features_per_level
@@ -143,11 +160,17 @@ class GridField(CoefficientField):
             int(sizes.finest_resolution) * (2 if space.is_unbounded else 1),
             int(sizes.log2_rows_per_level),
         )
+        low, high = space.box.aabb
         self.register_buffer("aabb", space.box.aabb.clone())
+        origin = (low + high) / 2 if space.is_unbounded else low.clone()
+        edge = (high - low).max() / 2 if space.is_unbounded else high - low
+        self.register_buffer("origin", origin, persistent=False)
+        self.register_buffer("edge", edge, persistent=False)
         table = torch.empty(self.layout.num_rows, config.features_per_level)
         self.table = nn.Parameter(nn.init.uniform_(table, -1e-4, 1e-4))
         self.density_network = bias_free_network(self.num_encoded, config.hidden_width, 1 + NUM_FEATURES)
         self.register_buffer("level_weights", torch.ones(config.num_levels) if space.coarse_to_fine else None)
+        self.sky_network: nn.Sequential | None = None
 
     def _add_sky(self) -> None:
         """The network of the sky or the backdrop, where there is one; the last that is made."""
@@ -158,31 +181,38 @@ class GridField(CoefficientField):
 
     @property
     def has_sky(self) -> bool:
-        return hasattr(self, "sky_network")
+        return self.sky_network is not None
 
-    def encoded(
-        self, positions: Float[Tensor, "S 3"], known: Float[Tensor, "S LF"] | None = None
-    ) -> Float[Tensor, "S LF"]:
-        """The hash grid's encoding of positions; `known` as `hash_encode` takes it."""
-        low, high = self.aabb
+    def encode(
+        self, positions: Float[Tensor, "S 3"], known: Float[Tensor, "S L"] | None = None
+    ) -> Float[Tensor, "S L"]:
+        """The hash grid's encoding of positions, and PE where it is seen; `known` as `hash_encode` takes it."""
+        unit = (positions - self.origin) / self.edge
         if self.is_unbounded:
-            unit = contracted_unit((positions - (low + high) / 2) / ((high - low).max() / 2))
-        else:
-            unit = (positions - low) / (high - low)
-        return hash_encode(unit, self.table, self.layout, known)
+            unit = contracted_unit(unit)
+        if not self.sees_positions:
+            return hash_encode(unit, self.table, self.layout, known)
+        of_grid = None if known is None else known[:, : self.num_encoded].contiguous()
+        # Sines and cosines of 2 pi times 1 and 2 periods a unit, of uncontracted positions.
+        angles = torch.cat([2 * math.pi * 2.0**power * positions for power in range(_NUM_FREQUENCIES)], -1)
+        encoded = hash_encode(unit, self.table, self.layout, of_grid)
+        return torch.cat([encoded, torch.cat([angles.sin(), angles.cos()], dim=-1)], dim=-1)
 
-    def density_and_raw(
-        self, encoded: Float[Tensor, "S LF"]
-    ) -> tuple[Float[Tensor, "S"], Float[Tensor, "S G"]]:
-        """Density per scene unit where the hash grid's encoding is `encoded`; the network's outputs, of which it is the
-        first."""
+    def density_of(self, encoded: Float[Tensor, "S L"]) -> tuple[Float[Tensor, "S"], Float[Tensor, "S G"]]:
+        """Density per scene unit; the network's outputs, of which it is the first, or g and PE."""
+        of_grid = encoded[:, : self.num_encoded] if self.sees_positions else encoded
         if self.level_weights is not None:
-            encoded = encoded * self.level_weights.repeat_interleave(self.config.features_per_level)
-        raw = in_parts(self.density_network, encoded)
-        return _bounded_exp(raw[:, 0] + self.log_initial_density), raw
+            of_grid = of_grid * self.level_weights.repeat_interleave(self.config.features_per_level)
+        features = in_parts(self.density_network, of_grid)
+        raw = features[:, 0] + self.log_initial_density
+        # Clamped in value only: a point that grew too dense can still become less dense.
+        density = (raw + (raw.clamp(max=_LARGEST_LOG_DENSITY) - raw).detach()).exp()
+        if self.sees_positions:
+            features = torch.cat([features[:, 1:], encoded[:, self.num_encoded :]], dim=-1)
+        return density, features
 
     def sky(self, rays: RayBundle) -> Float[Tensor, "R C"] | None:
-        if not self.has_sky:
+        if self.sky_network is None:
             return None
         features = sky_features(rays.directions) if self.is_unbounded else backdrop_features(rays)
         found = self.sky_network(features)
@@ -234,14 +264,6 @@ class UnmixField(GridField):
     def moving_lamp(self) -> MovingLamp | None:
         return self.lamp
 
-    def encode(
-        self, positions: Float[Tensor, "S 3"], known: Float[Tensor, "S LF"] | None = None
-    ) -> Float[Tensor, "S LF"]:
-        return self.encoded(positions, known)
-
-    def density_of(self, encoded: Float[Tensor, "S LF"]) -> tuple[Float[Tensor, "S"], Float[Tensor, "S G"]]:
-        return self.density_and_raw(encoded)
-
     def get_outputs(
         self,
         positions: Float[Tensor, "S 3"],
@@ -251,49 +273,76 @@ class UnmixField(GridField):
     ) -> dict[str, Tensor]:
         shading = self.lamp_shading
         lit = None if light is None or shading is None else shading(features, directions, light)
-        abundances, scales = self._material(features, directions, lit)
-        return {
-            "abundances": abundances,
-            "scaled_abundances": scales * abundances,
-            "specular_coefficients": self._specular(directions, features, lit),
-        }
-
-    def abundances_of(self, features: Float[Tensor, "S G"]) -> Float[Tensor, "S K"]:
-        return self._material(features)[0]
-
-    def _material(
-        self,
-        features: Float[Tensor, "S G"],
-        directions: Float[Tensor, "S 3"] | None = None,
-        lit: LitSurface | None = None,
-    ) -> tuple[Float[Tensor, "S K"], Float[Tensor, "S C"]]:
-        """Abundances and scales; C is 1 or K. Only scales depend on directions, and only in a moving light."""
         material = rows_of_outputs(self.material_network, features)
         # A softmax along a last axis of a few numbers takes ten times as long.
         abundances = torch.softmax(material[: self.num_endmembers] / self.config.temperature, dim=0).t()
         scales = material[self.num_endmembers :].t()
-        if self.lit_by_camera and directions is not None:
+        if self.lit_by_camera:
             # A sum over harmonics rather than a network of both: that took textures for shading.
             changes = self.shading_network(features) * direction_features(directions)
             scales = scales + changes.sum(dim=-1, keepdim=True)
         scales = torch.sigmoid(scales)
-        return abundances, scales if lit is None else scales * lit.brightness
+        if lit is not None:
+            scales = scales * lit.brightness
 
-    def _specular(
-        self, directions: Float[Tensor, "S 3"], features: Float[Tensor, "S G"], lit: LitSurface | None
-    ) -> Float[Tensor, "S J"]:
-        if self.num_specular == 0:
-            return features.new_zeros(len(features), 0)
-        if self.lamp is None:
-            seen = direction_features(directions)
-        else:
-            seen = features.new_zeros(len(features), len(LOBES)) if lit is None else lit.lobes
-        factors = torch.sigmoid(
-            rows_of_outputs(self.specular_network, features, seen) + self.specular_bias / 2
-        )
-        return (_BRIGHTEST * factors[:1] * factors[1:]).t()
+        specular = features.new_zeros(len(features), 0)
+        if self.num_specular:
+            if self.lamp is None:
+                seen = direction_features(directions)
+            else:
+                seen = features.new_zeros(len(features), len(LOBES)) if lit is None else lit.lobes
+            logits = rows_of_outputs(self.specular_network, features, seen) + self.specular_bias / 2
+            factors = torch.sigmoid(logits)
+            specular = (_BRIGHTEST * factors[:1] * factors[1:]).t()
+        return {
+            "abundances": abundances,
+            "scaled_abundances": scales * abundances,
+            "specular_coefficients": specular,
+        }
+
+    def abundances_of(self, features: Float[Tensor, "S G"]) -> Float[Tensor, "S K"]:
+        material = rows_of_outputs(self.material_network, features)
+        return torch.softmax(material[: self.num_endmembers] / self.config.temperature, dim=0).t()
 
 
-def _bounded_exp(raw: Float[Tensor, "S"]) -> Float[Tensor, "S"]:
-    """exp, clamped in value only: a point that grew too dense can still become less dense."""
-    return (raw + (raw.clamp(max=_LARGEST_LOG_DENSITY) - raw).detach()).exp()
+class PublishedField(GridField):
+    """Density, abundances, scales and one view-dependent value a band (J = B), of points in a scene box."""
+
+    def __init__(
+        self, config: UnmixFieldConfig, space: FieldSpace, num_endmembers: int, num_specular: int
+    ) -> None:
+        """
+        Args:
+            config, space, num_endmembers: As `GridField` takes them.
+            num_specular: J; 0 leaves the view-dependent part out.
+        """
+        super().__init__(config, space, num_endmembers, sees_positions=True)
+        self.num_specular = num_specular
+        width, num_features = config.hidden_width, NUM_FEATURES + _NUM_POSITION_FEATURES
+        self.material_network = bias_free_network(num_features, width, width, num_endmembers + 1)
+        self.scale_network = bias_free_network(num_features, width, width, num_endmembers)
+        if num_specular:
+            seen = NUM_DIRECTION_FEATURES + 1 + _NUM_POSITION_FEATURES
+            self.specular_network = bias_free_network(seen, 16, num_specular)
+        self._add_sky()
+
+    def get_outputs(
+        self,
+        positions: Float[Tensor, "S 3"],
+        directions: Float[Tensor, "S 3"],
+        features: Float[Tensor, "S G"],
+        light: Lamplight | None = None,
+    ) -> dict[str, Tensor]:
+        """With the tint from the network of the abundances."""
+        logits = self.material_network(features)
+        abundances = torch.softmax(logits[:, :-1] / self.config.temperature, dim=-1)
+        scaled = torch.sigmoid(self.scale_network(features)) * abundances
+        tinted = features.new_zeros(len(features), 0)
+        if self.num_specular:
+            tint, places = torch.sigmoid(logits[:, -1:]), features[:, -_NUM_POSITION_FEATURES:]
+            seen = [torch.ones_like(tint), direction_features(directions), places]
+            tinted = tint * torch.sigmoid(self.specular_network(torch.cat(seen, dim=-1)))
+        return {"abundances": abundances, "scaled_abundances": scaled, "specular_coefficients": tinted}
+
+    def abundances_of(self, features: Float[Tensor, "S G"]) -> Float[Tensor, "S K"]:
+        return torch.softmax(self.material_network(features)[:, :-1] / self.config.temperature, dim=-1)

@@ -24,7 +24,7 @@ from jaxtyping import Bool
 from torch import Tensor, nn
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
+from unmix_plugin.engine.geometry.space import RayBundle, SceneBox, UnitSpace
 from unmix_plugin.engine.model import (
     DataManager,
     Model,
@@ -33,7 +33,7 @@ from unmix_plugin.engine.model import (
     TrainOutputs,
 )
 from unmix_plugin.engine.runs.replacing import foreign, move_aside
-from unmix_plugin.field import FieldSpace, GridField, UnmixField
+from unmix_plugin.field import FieldSpace, GridField, PublishedField, UnmixField
 from unmix_plugin.light.lamp import Lamp
 from unmix_plugin.light.shading import ShadowDetail
 from unmix_plugin.losses.abundance_guide import AbundanceGuide, first_endmembers, first_specular_spectra
@@ -52,7 +52,6 @@ from unmix_plugin.poses.training import CorrectedRays, PoseTraining
 from unmix_plugin.presets import AlphaPreset, choose, preset_for
 from unmix_plugin.rendering.front_to_back import composite_view
 from unmix_plugin.rendering.grid_upkeep import GRID_INTERVAL, update_grid
-from unmix_plugin.rendering.published_field import PublishedField
 from unmix_plugin.rendering.renderer import RenderedRays, VolumeRenderer
 from unmix_plugin.sensors.views import BandBalance, MeasuredPixels, SensorViews, ViewGains, from_batch
 from unmix_plugin.settings import COARSEST_REFINED, UnmixModelConfig
@@ -291,12 +290,11 @@ class UnmixModel(Model):
         if self._renderer is None or self._renderer.skips is not self.grid.skips:
             config = self.config
             self._renderer = VolumeRenderer(
-                box=self.scene_box.to(self.device),
+                space=UnitSpace(self.scene_box.to(self.device), self.is_unbounded),
                 skips=self.grid.skips,
                 reachable=self.grid.reachable,
                 step=self.step,
                 smallest_weight=float(config.renderer.smallest_weight),
-                is_unbounded=self.is_unbounded,
                 residual_on_last_sample=config.losses.background == "last",
                 rays_per_chunk=self.rays_per_chunk,
                 opaque_skips=self.grid.opaque_skips,

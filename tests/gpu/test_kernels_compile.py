@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tests.factories.models import CAMERA, make_model
-from unmix_plugin.operators import compositing, contracted_marching, hash_encoding, marching, merging
+from unmix_plugin.operators import compositing, hash_encoding, marching, merging
 from unmix_plugin.operators.launching import warp
 
 pytestmark = pytest.mark.slow
@@ -20,7 +20,7 @@ def _specialised() -> None:
     model.renderer.normals(field, bundle, bundle.origins.new_full((len(bundle),), 4.0))
 
 
-@pytest.mark.parametrize("module", [marching, contracted_marching, hash_encoding, compositing, merging])
+@pytest.mark.parametrize("module", [marching, hash_encoding, compositing, merging])
 @pytest.mark.usefixtures("_specialised")
 def test_kernels_compile_to_code_for_a_gpu(module, tmp_path):
     warp().compile_aot_module(module, arch=80, module_dir=tmp_path, use_ptx=True)

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from unmix_plugin.operators.contracted_marching import (
+from unmix_plugin.operators.marching import (
     FAR_RADIUS,
     LINEAR_RADIUS,
     march_contracted_twin,

@@ -8,9 +8,8 @@ from torch.testing import assert_close
 from tests.factories.models import BOX, NUM_BANDS, make_model, make_rays, scene_of
 from unmix_plugin.engine.runs.config_json import config_from_json, config_to_json
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.field import FieldSpace
+from unmix_plugin.field import FieldSpace, PublishedField
 from unmix_plugin.method_config import unmix_nerf_published
-from unmix_plugin.rendering.published_field import PublishedField
 from unmix_plugin.settings import UnmixFieldConfig, UnmixModelConfig
 
 SIZES: dict[str, Any] = {

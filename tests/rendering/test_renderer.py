@@ -7,7 +7,7 @@ from torch import nn
 from torch.testing import assert_close
 
 from tests.factories.models import BOX
-from unmix_plugin.engine.geometry.space import RayBundle
+from unmix_plugin.engine.geometry.space import RayBundle, UnitSpace
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.field import FieldSpace, UnmixField
 from unmix_plugin.operators.compositing import volume_weights
@@ -32,7 +32,9 @@ def make(
     if depth is not None:
         nn.init.zeros_(field.table)
         field.log_initial_density = math.log(depth / step)
-    return VolumeRenderer(BOX, skip_distances(cells), cells, step, smallest_weight, rays_per_chunk=7), field
+    return VolumeRenderer(
+        UnitSpace(BOX), skip_distances(cells), cells, step, smallest_weight, rays_per_chunk=7
+    ), field
 
 
 def rays(num_rays: int) -> RayBundle:
@@ -165,7 +167,7 @@ def test_samples_found_from_the_front_are_those_of_all(monkeypatch, smallest_wei
         field.table.normal_(std=3.0, generator=torch.Generator().manual_seed(2))
         samples = samples_of(renderer, bundle)
         found = visible_samples(field, samples, bundle, step=step, smallest_weight=smallest_weight)
-        encoded = field.encode(rendering.points_of(samples, bundle)[0])
+        encoded = field.encode(rendering.points_of(bundle, samples.ray_indices, samples.t)[0])
         densities, features = field.density_of(encoded)
         keep = volume_weights(densities * step, samples.packed_info) > smallest_weight
     assert torch.equal(found.samples.t, samples.t[keep])

@@ -8,7 +8,7 @@ from torch.testing import assert_close
 
 from tests.factories.models import BOX, make_model, make_rays
 from unmix_plugin.editing.edited_field import EditedField
-from unmix_plugin.engine.geometry.space import RayBundle
+from unmix_plugin.engine.geometry.space import RayBundle, UnitSpace
 from unmix_plugin.engine.processes import Processes
 from unmix_plugin.field import FieldSpace, UnmixField
 from unmix_plugin.operators.compositing import scale_gradient
@@ -28,7 +28,7 @@ def make(density: float = 1e-6) -> tuple[VolumeRenderer, UnmixField]:
     with torch.no_grad():
         field.table.zero_()
     cells = torch.ones(16, 16, 16)
-    return VolumeRenderer(BOX, skip_distances(cells > 0), cells > 0, 0.05, 0.0, is_unbounded=True), field
+    return VolumeRenderer(UnitSpace(BOX, True), skip_distances(cells > 0), cells > 0, 0.05, 0.0), field
 
 
 def rays(num_rays: int) -> RayBundle:
@@ -45,7 +45,7 @@ def test_the_sky_fills_what_matter_leaves_and_is_no_matter():
         with torch.no_grad():
             found = renderer.render(field, bundle)
             sky = field.sky(bundle)
-            del field.sky_network
+            field.sky_network = None
             bare = renderer.render(field, bundle)
         assert sky is not None
         left = 1 - found.coefficients.accumulation[:, None]
@@ -74,7 +74,7 @@ def test_rays_end_on_what_stands_outside_the_box():
     assert bool(inner)
     occupied = renderer.skips == 0
     occupied[4:12, 4:12, 4:12] = False  # nothing in the box
-    shell = VolumeRenderer(BOX, skip_distances(occupied), occupied, 0.05, 0.0, is_unbounded=True)
+    shell = VolumeRenderer(UnitSpace(BOX, True), skip_distances(occupied), occupied, 0.05, 0.0)
     with torch.no_grad():
         found = shell.render(field, rays(30)).coefficients
     assert (found.accumulation > 0.99).all()
@@ -131,7 +131,7 @@ def test_a_world_without_end_begins_with_cells_as_large_as_those_of_a_coarse_gri
             blocks.append(block)
 
     for is_unbounded in (True, False):
-        renderer = replace(make()[0], is_unbounded=is_unbounded)
+        renderer = replace(make()[0], space=UnitSpace(BOX, is_unbounded))
         grid = Watched(torch.ones(128, 128, 128) > 0)
         for progress in (0.0, 0.4, 0.6):
             update_grid(grid, make()[1], renderer, Processes(), None, progress=progress)
@@ -158,6 +158,7 @@ def test_a_backdrop_brighter_and_darker_than_its_endmember_is_learnt():
     across = torch.linspace(-0.7, 0.7, 64)
     bundle = replace(rays(64), offsets=torch.stack([across, across], dim=1))
     wanted = 1.3 - 1.2 * across.square()
+    assert field.sky_network is not None
     optimizer = torch.optim.Adam(field.sky_network.parameters(), lr=0.01)
     loss = wanted.new_ones(())
     for _ in range(300):
@@ -176,7 +177,9 @@ def test_a_bounded_field_has_a_sky_behind_all_matter_only_where_there_is_a_backd
     assert not [name for name in bare.state_dict() if "sky" in name]
     field = UnmixField(SMALL, FieldSpace(BOX, 1e-9, 0.1, has_backdrop=True), 3, 1)
     reachable = torch.ones((8, 8, 8), dtype=torch.bool)
-    renderer = VolumeRenderer(BOX, torch.zeros((8, 8, 8), dtype=torch.uint8), reachable, 0.05, 1e-3)
+    renderer = VolumeRenderer(
+        UnitSpace(BOX), torch.zeros((8, 8, 8), dtype=torch.uint8), reachable, 0.05, 1e-3
+    )
     bundle = rays(20)
     with torch.no_grad():
         found = renderer.render(field, bundle)

@@ -17,7 +17,7 @@ Notation: `S` samples, `R` rays, `X Y Z` cells of a grid over the scene box, `F`
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 from itertools import pairwise
 
@@ -105,33 +105,34 @@ def bias_free_network(*widths: int) -> nn.Sequential:
 def rows_of_outputs(network: nn.Sequential, *inputs: Float[Tensor, "S _"]) -> Float[Tensor, "O S"]:
     """What a bias-free network gives, an output a row: products with few columns take twice as long. Its inputs come
     side by side, as joining them would cost time."""
-    return torch.cat([_rows_of_part(network, *part) for part in _parts(*inputs)], dim=1)
+    first, *inner, last = network
+    assert isinstance(first, nn.Linear)
+    assert isinstance(last, nn.Linear)
+    weights = first.weight.split([values.shape[1] for values in inputs], dim=1)
+    found = []
+    for part, *others in _parts(*inputs):
+        hidden = part @ weights[0].t()
+        for values, weight in zip(others, weights[1:], strict=True):
+            hidden.addmm_(values, weight.t())
+        for layer in inner:
+            hidden = layer(hidden)
+        found.append(last.weight @ hidden.t())
+    return found[0] if len(found) == 1 else torch.cat(found, dim=1)
 
 
 def in_parts(network: nn.Sequential, inputs: Float[Tensor, "S F"]) -> Float[Tensor, "S O"]:
     """What a network gives of samples, as `_parts` has them."""
-    return torch.cat([network(part) for (part,) in _parts(inputs)])
+    found = [network(part) for (part,) in _parts(inputs)]
+    return found[0] if len(found) == 1 else torch.cat(found)
 
 
-def _rows_of_part(network: nn.Sequential, *inputs: Float[Tensor, "S _"]) -> Float[Tensor, "O S"]:
-    first, *inner, last = network
-    assert isinstance(first, nn.Linear)
-    weights = first.weight.split([values.shape[1] for values in inputs], dim=1)
-    hidden = inputs[0] @ weights[0].t()
-    for values, weight in zip(inputs[1:], weights[1:], strict=True):
-        hidden.addmm_(values, weight.t())
-    for layer in inner:
-        hidden = layer(hidden)
-    assert isinstance(last, nn.Linear)
-    return last.weight @ hidden.t()
-
-
-def _parts(*values: Float[Tensor, "S _"]) -> Iterator[tuple[Float[Tensor, "_ _"], ...]]:
+def _parts(*values: Float[Tensor, "S _"]) -> Sequence[tuple[Float[Tensor, "_ _"], ...]]:
     """The same rows of all; without gradients few at a time, so that a hidden layer of them stays in the cache."""
     # As many for each thread: they wait for one another after every part.
     at_once = _CACHED_ROWS * torch.get_num_threads()
-    size = max(len(values[0]), 1) if torch.is_grad_enabled() else at_once
-    return zip(*(each.split(size) for each in values), strict=True)
+    if torch.is_grad_enabled() or len(values[0]) <= at_once:
+        return [values]
+    return list(zip(*(each.split(at_once) for each in values), strict=True))
 
 
 LOBES = (8.0, 32.0, 128.0, 512.0)

@@ -78,7 +78,9 @@ def hash_encode(
     Raises:
         ValueError: the table's shape isn't the layout's.
     """
-    _check_table(table, layout)
+    expected = (layout.num_rows, layout.features_per_level)
+    if tuple(table.shape) != expected:
+        raise ValueError(f"table must have shape {expected} for this layout; got {tuple(table.shape)}")
     return _HashEncode.apply(positions.contiguous(), table.contiguous(), layout, known)  # type: ignore[no-any-return]
 
 
@@ -86,7 +88,6 @@ def hash_encode_twin(
     positions: Float[Tensor, "S 3"], table: Float[Tensor, "R F"], layout: HashGridLayout
 ) -> Float[Tensor, "S LF"]:
     """The same as `hash_encode` in plain PyTorch: the readable definition, checked against the kernel."""
-    _check_table(table, layout)
     encoded = []
     offsets = torch.tensor([[k & 1, (k >> 1) & 1, k >> 2] for k in range(8)], device=positions.device)
     for resolution, first_row, num_rows in layout.levels.tolist():
@@ -108,12 +109,6 @@ def hash_encode_twin(
 def _levels_on(layout: HashGridLayout, device: torch.device) -> Int[Tensor, "L 3"]:
     """The layout's levels where the kernels read them: copied there once, not at each call."""
     return layout.levels.to(device)
-
-
-def _check_table(table: Tensor, layout: HashGridLayout) -> None:
-    expected = (layout.num_rows, layout.features_per_level)
-    if tuple(table.shape) != expected:
-        raise ValueError(f"table must have shape {expected} for this layout; got {tuple(table.shape)}")
 
 
 class _HashEncode(torch.autograd.Function):

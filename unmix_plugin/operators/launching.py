@@ -148,36 +148,34 @@ def launch(
             recorded = wp.launch(concrete, dim=1, inputs=inputs, device="cpu", record_cmd=True)
             recorded.params, recorded.fwd_args = recorded.params[:1], None
             _RECORDED[concrete] = recorded
-    commands = _parts(recorded, size, part, values)
-    _run(commands, threads)
 
-
-def _parts(recorded: Any, size: int, part: int, values: Sequence[Any]) -> list[Any]:
-    """Launches of ranges of work items, as one was recorded: Warp takes ten times as long to make each anew."""
+    # A launch of each range of work items, as one was recorded: Warp takes ten times as long to make each anew.
     kinds = [argument.type for argument in recorded.kernel.adj.args]
+    bound = kinds[0]._type_
     shared = [
         kind._type_(x) if isinstance(x, float | int) else x for kind, x in zip(kinds[3:], values, strict=True)
     ]
     commands = []
-    for first in range(0, size, part):
+    for begin in range(0, size, part):
         command = copy(recorded)
-        bounds = [kind._type_(x) for kind, x in zip(kinds, (first, min(first + part, size), 1), strict=False)]
-        command.params = [*recorded.params, *bounds, *shared]
+        command.params = [
+            *recorded.params,
+            bound(begin),
+            bound(min(begin + part, size)),
+            bound(1),
+            *shared,
+        ]
         commands.append(command)
-    return commands
 
-
-def _run(commands: Sequence[Any], threads: int) -> None:
-    """Run packed launches on this thread and on others that have nothing else to do."""
-    # One iterator for all threads, whose steps the interpreter doesn't interrupt: each command is taken once.
+    # This thread runs them, and others that have nothing else to do: one iterator for all, whose steps the interpreter
+    # doesn't interrupt, so that each is taken once.
     remaining = iter(commands)
 
     def work() -> None:
         for command in remaining:
             command.launch()
 
-    num_helpers = min(threads, len(commands)) - 1
-    helpers = [_pool(threads - 1).submit(work) for _ in range(num_helpers)]
+    helpers = [_pool(threads - 1).submit(work) for _ in range(min(threads, len(commands)) - 1)]
     work()
     for helper in helpers:
         if not helper.cancel():

@@ -1,16 +1,22 @@
-"""Samples along rays, only in the occupied cells of an occupancy grid.
+"""Samples along rays, only in the occupied cells of an occupancy grid: over a box, or over contracted space.
 
 Notation: `R` rays, `S` samples in all, stored packed: the samples of a ray are consecutive and `packed_info` holds
-(first sample, count) a ray. Points are in the unit cube that the grid fills, `t` in the unit of the ray parameter.
+(first sample, count) a ray; `t` is in the unit of the ray parameter.
 
-Of the kernels a work item is a ray. Samples lie at t = t_near + (i + jitter) * step for integer i. From an empty
-lattice point a ray goes on to the first one that may lie in an occupied cell, by the skips of the cell: working out
-where a cell ends costs more. Near occupied cells several points are looked up at once, empty or not: look-ups that
-don't wait for one another cost a tenth of those that do.
+In a box points are in the unit cube that the grid fills, and samples lie at t = t_near + (i + jitter) * step for
+integer i. In an unbounded world points are in units of the inner cube's half edge, centred on it. Rays start at their
+origins; samples lie `step` apart within the inner cube and farther apart outside, as the contracted cells are: `step` r
+up to r = 2, `step` r^2 / 2 beyond, r the maximum norm. They end at r = 512, behind which nothing but the sky is told
+apart. Every sample counts for one `step`, however long its interval: density is per unit of contracted space, and a
+sample is as opaque anywhere in an untrained field.
+
+Of the kernels a work item is a ray. From an empty point a ray goes on to the first one that may lie in an occupied
+cell, by the skips of the cell: working out where a cell ends costs more. In a box, near occupied cells, several points
+are looked up at once, empty or not: look-ups that don't wait for one another cost a tenth of those that do. Contraction
+lengthens no way by more than a third, in the maximum norm.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, no_type_check
 
 import torch
@@ -18,7 +24,8 @@ import warp as wp
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
-from unmix_plugin.operators.launching import KernelArray, as_warp, launch, vector_type
+from unmix_plugin.engine.geometry.space import contracted_unit
+from unmix_plugin.operators.launching import as_warp, launch, vector_type
 from unmix_plugin.operators.occupancy import cells_at
 
 
@@ -35,19 +42,13 @@ class PackedSamples:
     def __len__(self) -> int:
         return len(self.t)
 
-    def rows(self, chosen: Int[Tensor, "some"]) -> "PackedSamples":
-        """Some samples by their places, with no regard to which belong to one ray: `packed_info` stays as it is."""
-        t, rays = (values.index_select(0, chosen) for values in (self.t, self.ray_indices))
-        return PackedSamples(t, rays, self.packed_info)
-
     def select(self, keep: Bool[Tensor, "S"]) -> "PackedSamples":
         """Only the samples marked in `keep`, still packed."""
         kept_before = torch.cat([keep.new_zeros(1, dtype=torch.int64), keep.cumsum(0)])
         starts = kept_before[self.packed_info[:, 0]]
         ends = kept_before[self.packed_info[:, 0] + self.packed_info[:, 1]]
-        return replace(
-            self.rows(keep.nonzero()[:, 0]), packed_info=torch.stack([starts, ends - starts], dim=-1)
-        )
+        t, rays = (values.index_select(0, keep.nonzero()[:, 0]) for values in (self.t, self.ray_indices))
+        return PackedSamples(t, rays, torch.stack([starts, ends - starts], dim=-1))
 
 
 @dataclass(frozen=True)
@@ -64,43 +65,36 @@ class FirstSamples:
 
 @dataclass(frozen=True)
 class GridRays:
-    """Rays through a grid, as a kernel takes them."""
+    """Rays through a grid, and the kernel that finds their samples."""
 
-    origins: Float[Tensor, "R 3"]
     kernel: Any
-    arguments: list[KernelArray | Tensor | float]
-    """Its first ones."""
-
-    @staticmethod
-    def of(
-        kernel: Any,
-        lines: Sequence[Float[Tensor, "R 3"]],
-        numbers: Sequence[Float[Tensor, "R"]],
-        skips: UInt8[Tensor, "X Y Z"],
-        step: float,
-    ) -> "GridRays":
-        """Rays of origins and directions, with what else the kernel takes of each ray, in float32. Raises ValueError:
-        step isn't positive."""
-        check_step(step)
-        point = vector_type(3, torch.float32)
-        arrays = [as_warp(values.contiguous(), point) for values in lines]
-        numbers = [values.contiguous() for values in numbers]
-        return GridRays(lines[0], kernel, [*arrays, *numbers, step, skips.contiguous()])
+    lines: tuple[Float[Tensor, "R 3"], Float[Tensor, "R 3"]]
+    """Origins and directions."""
+    numbers: tuple[Float[Tensor, "R"], ...]
+    """What else the kernel takes of each ray."""
+    skips: UInt8[Tensor, "X Y Z"]
+    step: float
 
     def first_samples(self, most: int) -> FirstSamples:
-        """At most so many samples of each ray by one launch, which writes them where there is room for as many."""
-        num_rays = len(self.origins)
-        t = self.origins.new_empty(num_rays, most, dtype=torch.float32)
-        ends = self.origins.new_empty(num_rays, dtype=torch.float32)
-        counts = torch.empty(num_rays, dtype=torch.int64, device=t.device)
-        launch(self.kernel, num_rays, [*self.arguments, t, counts, ends], t.device)
+        """At most so many samples of each ray by one launch, which writes them where there is room for as many. Raises
+        ValueError: step isn't positive."""
+        _check_step(self.step)
+        num_rays, point = len(self.lines[0]), vector_type(3, torch.float32)
+        t = self.lines[0].new_empty(num_rays, most, dtype=torch.float32)
+        ends, counts = t.new_empty(num_rays), torch.empty(num_rays, dtype=torch.int64, device=t.device)
+        arrays = [as_warp(values.contiguous(), point) for values in self.lines]
+        arrays += [as_warp(values.contiguous()) for values in self.numbers]
+        launch(
+            self.kernel, num_rays, [*arrays, self.step, self.skips.contiguous(), t, counts, ends], t.device
+        )
         return FirstSamples(t, counts, ends)
 
     def samples(self) -> PackedSamples:
         """All samples by one launch, and another with twice the room for each ray where one may have more."""
-        most = max(1, min(_ROOM // max(len(self.origins), 1), _MOST_SAMPLES))
+        num_rays = len(self.lines[0])
+        most = max(1, min(_ROOM // max(num_rays, 1), _MOST_SAMPLES))
         found = self.first_samples(most)
-        while len(self.origins) and int(found.counts.max()) == most:
+        while num_rays and int(found.counts.max()) == most:
             most *= 2
             found = self.first_samples(most)
         starts = most * torch.arange(len(found.counts), device=found.counts.device)
@@ -141,10 +135,8 @@ def rays_in_box(
         jitter: Offset of each ray's lattice in steps, [0, 1).
         skips: 0 in occupied cells, as `skip_distances` says; cell (x, y, z) is [x/X, (x+1)/X] and so on.
         step: Distance of neighbouring samples in the ray parameter, > 0.
-    Raises:
-        ValueError: step isn't positive.
     """
-    return GridRays.of(_write_kernel, (origins, directions), (t_near, t_far, jitter), skips, step)
+    return GridRays(_box_kernel, (origins, directions), (t_near, t_far, jitter), skips, step)
 
 
 def march_twin(
@@ -157,7 +149,7 @@ def march_twin(
     step: float,
 ) -> PackedSamples:
     """`rays_in_box(...).samples()` in plain PyTorch: tests every lattice point of every ray."""
-    check_step(step)
+    _check_step(step)
     t_first = t_near + jitter * step
     longest = float((t_far - t_first).max()) if len(t_far) else 0.0
     index = torch.arange(max(int(longest / step) + 2, 1), device=origins.device)
@@ -175,7 +167,7 @@ def packed_where(hit: Bool[Tensor, "R M"], t: Float[Tensor, "R M"]) -> PackedSam
     return PackedSamples(t[hit], hit.nonzero()[:, 0], info)
 
 
-def check_step(step: float) -> None:
+def _check_step(step: float) -> None:
     """Refuse a distance of samples that isn't positive."""
     if not step > 0:
         raise ValueError(f"step must be positive; got {step}")
@@ -235,7 +227,7 @@ def _ray_at(
 
 @wp.func
 @no_type_check
-def _skip_at(ray: _Ray, t: float, skips: wp.array3d(dtype=wp.uint8)):
+def _box_skip_at(ray: _Ray, t: float, skips: wp.array3d(dtype=wp.uint8)):
     x = wp.clamp(int(ray.origin[0] + t * ray.direction[0]), 0, skips.shape[0] - 1)
     y = wp.clamp(int(ray.origin[1] + t * ray.direction[1]), 0, skips.shape[1] - 1)
     z = wp.clamp(int(ray.origin[2] + t * ray.direction[2]), 0, skips.shape[2] - 1)
@@ -251,7 +243,7 @@ def _points_to_next(ray: _Ray, clear: int):
 
 @wp.kernel(enable_backward=False)
 @no_type_check
-def _write_kernel(
+def _box_kernel(
     first: int,
     end: int,
     stride: int,
@@ -274,11 +266,11 @@ def _write_kernel(
         i = int(0)  # noqa: RUF046, UP018
         last = ray.t_first
         while slot < own.shape[0] and i < ray.num_points:
-            clear = _skip_at(ray, _point_at(ray, step, i), skips)
+            clear = _box_skip_at(ray, _point_at(ray, step, i), skips)
             if clear <= _NEAR:
                 for k in range(8):
                     t = _point_at(ray, step, i + k)
-                    clear = _skip_at(ray, t, skips)
+                    clear = _box_skip_at(ray, t, skips)
                     if clear == 0 and slot < own.shape[0] and i + k < ray.num_points:
                         own[slot] = t
                         last = t
@@ -287,4 +279,140 @@ def _write_kernel(
             i += _points_to_next(ray, clear)
         counts[index] = wp.int64(slot)
         ends[index] = last + (1.0 - jitter[index]) * step
+        index += stride
+
+
+FAR_RADIUS = 512.0
+LINEAR_RADIUS = 2.0
+
+
+def rays_in_world(
+    origins: Float[Tensor, "R 3"],
+    directions: Float[Tensor, "R 3"],
+    t_start: Float[Tensor, "R"],
+    jitter: Float[Tensor, "R"],
+    skips: UInt8[Tensor, "X Y Z"],
+    step: float,
+) -> GridRays:
+    """Rays whose samples go up to r = 512, as far as they lie in occupied cells of contracted space.
+
+    Args:
+        origins, directions: Rays in units of the inner cube's half edge.
+        t_start: 0, or the `ends` of the samples before.
+        jitter, skips, step: As `rays_in_box` takes them, in the inner cube; the grid fills the cube from -2 to 2.
+    """
+    return GridRays(_world_kernel, (origins, directions), (t_start, jitter), skips, step)
+
+
+def march_contracted_twin(
+    origins: Float[Tensor, "R 3"],
+    directions: Float[Tensor, "R 3"],
+    t_start: Float[Tensor, "R"],
+    jitter: Float[Tensor, "R"],
+    skips: UInt8[Tensor, "X Y Z"],
+    step: float,
+) -> PackedSamples:
+    """`rays_in_world(...).samples()` in plain PyTorch: walks all rays at once."""
+    _check_step(step)
+    t = t_start
+    found: list[tuple[Tensor, Tensor]] = []
+    while True:
+        radius = (origins + t[:, None] * directions).abs().amax(dim=-1)
+        is_inside = radius <= FAR_RADIUS
+        if not bool(is_inside.any()):
+            break
+        near = radius.clamp(min=1.0)
+        stride = step * near * (near / LINEAR_RADIUS).clamp(min=1.0)
+        at = t + jitter * stride
+        unit = contracted_unit(origins + at[:, None] * directions)
+        hit = is_inside & (skips[tuple(cells_at(unit, skips.shape).unbind(-1))] == 0)
+        found.append((hit, at))
+        t = torch.where(is_inside, t + stride, t)
+    nothing = torch.zeros(len(origins), 0, device=origins.device)
+    columns = [torch.stack(values, dim=1) for values in zip(*found, strict=True)]
+    return packed_where(*columns) if found else packed_where(nothing > 0, nothing)
+
+
+@wp.func
+@no_type_check
+def _radius_at(point: wp.vec3f):
+    return wp.max(wp.max(wp.abs(point[0]), wp.abs(point[1])), wp.abs(point[2]))
+
+
+@wp.func
+@no_type_check
+def _stride_at(radius: float, step: float):
+    near = wp.max(radius, 1.0)
+    return step * near * wp.max(near / 2.0, 1.0)
+
+
+@wp.func
+@no_type_check
+def _world_skip_at(point: wp.vec3f, skips: wp.array3d(dtype=wp.uint8)):
+    radius = wp.max(_radius_at(point), 1.0)
+    unit = point * ((2.0 - 1.0 / radius) / radius) / 4.0 + wp.vec3f(0.5, 0.5, 0.5)
+    x = wp.clamp(int(unit[0] * float(skips.shape[0])), 0, skips.shape[0] - 1)
+    y = wp.clamp(int(unit[1] * float(skips.shape[1])), 0, skips.shape[1] - 1)
+    z = wp.clamp(int(unit[2] * float(skips.shape[2])), 0, skips.shape[2] - 1)
+    return int(skips[x, y, z])
+
+
+@wp.func
+@no_type_check
+def _cube_exit(origin: wp.vec3f, direction: wp.vec3f):
+    """Where a ray from within the inner cube leaves it."""
+    to_face = wp.vec3f(1.0, 1.0, 1.0) - wp.cw_mul(
+        origin, wp.vec3f(wp.sign(direction[0]), wp.sign(direction[1]), wp.sign(direction[2]))
+    )
+    slowest = 1.0e-9
+    x = to_face[0] / wp.max(wp.abs(direction[0]), slowest)
+    y = to_face[1] / wp.max(wp.abs(direction[1]), slowest)
+    z = to_face[2] / wp.max(wp.abs(direction[2]), slowest)
+    return wp.min(wp.min(x, y), z)
+
+
+@wp.kernel(enable_backward=False)
+@no_type_check
+def _world_kernel(
+    first: int,
+    end: int,
+    stride: int,
+    origins: wp.array(dtype=wp.vec3f),
+    directions: wp.array(dtype=wp.vec3f),
+    t_start: wp.array(dtype=float),
+    jitter: wp.array(dtype=float),
+    step: float,
+    skips: wp.array3d(dtype=wp.uint8),
+    t_samples: wp.array2d(dtype=float),
+    counts: wp.array(dtype=wp.int64),
+    ends: wp.array(dtype=float),
+):
+    index = first + wp.tid()
+    while index < end:
+        own = t_samples[index]
+        slot = int(0)  # noqa: RUF046, UP018
+        t = t_start[index]
+        origin, direction = origins[index], directions[index]
+        leaves = _cube_exit(origin, direction)
+        # A ray may go so far for each cell of clearance; a little less, since coordinates are rounded.
+        clear_way = (
+            2.99
+            / float(wp.max(wp.max(skips.shape[0], skips.shape[1]), skips.shape[2]))
+            / _radius_at(direction)
+        )
+        radius = _radius_at(origin + t * direction)
+        while slot < own.shape[0] and radius <= 512.0:
+            length = _stride_at(radius, step)
+            middle = t + jitter[index] * length
+            clear = _world_skip_at(origin + middle * direction, skips)
+            # An empty point's entry is overwritten by the next point's.
+            own[slot] = middle
+            slot += 1 - wp.min(clear, 1)
+            if clear > 1 and radius <= 1.0:
+                way = wp.min(float(clear - 1) * clear_way, leaves - t)
+                length *= float(1 + int(wp.max(way, 0.0) / step))
+            t += length
+            radius = _radius_at(origin + t * direction)
+        counts[index] = wp.int64(slot)
+        ends[index] = t
         index += stride

@@ -23,8 +23,8 @@ from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.field import CoefficientField
 from unmix_plugin.operators.compositing import accumulate
 from unmix_plugin.operators.marching import packed_rows
-from unmix_plugin.operators.merging import MergedSamples, MergeLimits, merge_samples
-from unmix_plugin.rendering.renderer import VolumeRenderer, before_sky, coefficients_of
+from unmix_plugin.operators.merging import MergeLimits, merge_samples
+from unmix_plugin.rendering.renderer import VolumeRenderer, coefficients_of
 from unmix_plugin.spectral.materials import Coefficients
 
 _MERGED_WEIGHT = 125.0
@@ -57,66 +57,17 @@ class _ActiveRays:
     t_end: Float[Tensor, "A"]
     """From where to march on."""
 
-    @staticmethod
-    def at_camera(rays: Int[Tensor, "A"], like: Float[Tensor, "_ _"]) -> _ActiveRays:
-        """Rays of which nothing was marched yet."""
-        zeros, numbers = torch.zeros_like(rays), like.new_zeros(len(rays))
-        t = like.new_zeros(len(rays), SAMPLES_MARCHED)
-        wanted = zeros + _samples_at_once(like)
-        return _ActiveRays(rays, numbers + 1, wanted, zeros, t, zeros, zeros, numbers)
-
-    def __len__(self) -> int:
-        return len(self.rays)
-
     def select(self, chosen: Int[Tensor, "N"]) -> _ActiveRays:
         """Some of the rays."""
         return _ActiveRays(*(getattr(self, each.name).index_select(0, chosen) for each in fields(self)))
 
-    def join(self, more: _ActiveRays) -> _ActiveRays:
-        """With other rays."""
-        pairs = ((getattr(self, each.name), getattr(more, each.name)) for each in fields(self))
-        return _ActiveRays(*map(torch.cat, pairs))
-
-    def march(self, ray_bundle: RayBundle, renderer: VolumeRenderer) -> _ActiveRays:
-        """With further samples of the rays whose samples are evaluated; without rays that have none."""
-        is_used_up = self.next == self.count
-        rows = is_used_up.nonzero()[:, 0]
-        lines = _lines(ray_bundle, self.rays.index_select(0, rows))
-        found = renderer.march(*lines, self.t_end.index_select(0, rows)).first_samples(SAMPLES_MARCHED)
-        marched = replace(
-            self,
-            t=self.t.index_copy(0, rows, found.t),
-            count=self.count.index_copy(0, rows, found.counts),
-            next=self.next.masked_fill(is_used_up, 0),
-            t_end=self.t_end.index_copy(0, rows, found.ends),
-        )
-        return marched.select(marched.count.nonzero()[:, 0])
-
-    def next_counts(self) -> Int[Tensor, "A"]:
-        """How many samples of each are evaluated next."""
-        return torch.minimum(self.wanted, self.count - self.next)
-
-    def behind(self, transmittance: Float[Tensor, "A"], smallest: float) -> _ActiveRays:
-        """Behind these samples, the rays that have light left and may meet more."""
-        evaluated = self.next_counts()
-        position, num_evaluated = self.next + evaluated, self.num_evaluated + evaluated
-        enough = evaluated / _DENSER * (transmittance / smallest).log()
-        enough /= (self.transmittance / transmittance).log()
-        enough = enough.ceil().nan_to_num(nan=torch.inf)  # no number if both logarithms are infinite
-        at_first = _samples_at_once(transmittance)
-        fewest = 1 if at_first < SAMPLES_MARCHED else SAMPLES_MARCHED
-        wanted = torch.minimum(enough, num_evaluated.clamp(min=at_first)).clamp(min=fewest).long()
-        passed = replace(
-            self, transmittance=transmittance, wanted=wanted, num_evaluated=num_evaluated, next=position
-        )
-        may_have_more = (position < self.count) | (self.count == SAMPLES_MARCHED)
-        return passed.select(((transmittance > smallest) & may_have_more).nonzero()[:, 0])
-
-
-def _samples_at_once(like: Tensor) -> int:
-    """Samples of each ray to evaluate together at first; on a GPU always as many as are marched, since it computes more
-    of them in less time than the processor takes to ask again."""
-    return FEWEST_SAMPLES if like.device.type == "cpu" else SAMPLES_MARCHED
+    def join(self, rays: Int[Tensor, "N"], wanted: int) -> _ActiveRays:
+        """With further rays of which nothing was marched yet; of each so many samples are evaluated first."""
+        none, start = torch.zeros_like(rays), self.t_end.new_zeros(len(rays))
+        t = self.t.new_zeros(len(rays), SAMPLES_MARCHED)
+        further = (rays, start + 1, none + wanted, none, t, none, none, start)
+        own = (getattr(self, each.name) for each in fields(self))
+        return _ActiveRays(*map(torch.cat, zip(own, further, strict=True)))
 
 
 @torch.no_grad()
@@ -139,69 +90,87 @@ def composite_view(
 def composite(renderer: VolumeRenderer, field: CoefficientField, ray_bundle: RayBundle) -> Coefficients:
     """Coefficients (R, ...) of each ray, few rays at a time in memory: those of `VolumeRenderer.render` but for what
     this module says, in less time."""
-    found, chunk = _composite_foreground(renderer, field, ray_bundle), renderer.rays_per_chunk
+    found, chunk = _before_any_sky(renderer, field, ray_bundle), renderer.rays_per_chunk
     parts = [field.sky(ray_bundle[first : first + chunk]) for first in range(0, len(ray_bundle), chunk)]
     skies = [sky for sky in parts if sky is not None]
-    return before_sky(found, torch.cat(skies) if skies else None)[0]
+    return found.before(torch.cat(skies))[0] if skies else found
 
 
-def _composite_foreground(
-    renderer: VolumeRenderer, field: CoefficientField, ray_bundle: RayBundle
-) -> Coefficients:
-    """Coefficients (R, ...) of each ray of a field, before any sky."""
-    origins, smallest = ray_bundle.origins, renderer.smallest_weight
+def _before_any_sky(renderer: VolumeRenderer, field: CoefficientField, ray_bundle: RayBundle) -> Coefficients:
+    """Coefficients (R, ...) of what rays meet in the field."""
+    origins, directions, smallest = ray_bundle.origins, ray_bundle.directions, renderer.smallest_weight
     limits = MergeLimits(renderer.step, smallest, _MERGED_WEIGHT * smallest)
+    # On a GPU always as many as are marched: it computes more in less time than the processor takes to ask again.
+    at_first = FEWEST_SAMPLES if origins.device.type == "cpu" else SAMPLES_MARCHED
+    fewest = 1 if at_first < SAMPLES_MARCHED else SAMPLES_MARCHED
     pending = torch.arange(len(origins), device=origins.device)
-    active = _ActiveRays.at_camera(pending[:0], origins)
-    features = field.density_of(field.encode(origins[:0]))[1]
-    nothing = _coefficients(renderer, field, (origins[:0], origins[:0]), origins[:0, 0], features)
-    totals = nothing.packed.new_zeros(len(origins), nothing.packed.shape[1])
-    last = torch.zeros_like(totals) if renderer.residual_on_last_sample else None
-    while len(pending) or len(active):
-        room = max(renderer.rays_per_chunk - len(active), 0)
-        active = active.join(_ActiveRays.at_camera(pending[:room], origins)).march(ray_bundle, renderer)
-        pending = pending[room:]
-        merged = _evaluate(field, ray_bundle, active, limits)
-        lines = _lines(ray_bundle, active.rays.index_select(0, merged.ray_indices))
-        values = _coefficients(renderer, field, lines, merged.t, merged.features).packed
-        totals.index_add_(0, active.rays, accumulate(merged.weights, values, merged.packed_info))
-        if last is not None:
+    none, numbers = pending[:0], origins[:0, 0]
+    t = origins.new_zeros(0, SAMPLES_MARCHED)
+    active = _ActiveRays(none, numbers, none, none, t, none, none, numbers)
+    totals = last = origins.new_zeros(len(origins), 0)
+    num_endmembers = 0
+    while True:
+        # Pending rays take the room of those that ended.
+        room = max(renderer.rays_per_chunk - len(active.rays), 0)
+        active, pending = active.join(pending[:room], at_first), pending[room:]
+
+        # Rays whose samples are evaluated are marched on; those that meet nothing more end.
+        is_used_up = active.next == active.count
+        rows = is_used_up.nonzero()[:, 0]
+        rays = active.rays.index_select(0, rows)
+        lines = origins.index_select(0, rays), directions.index_select(0, rays)
+        found = renderer.march(*lines, active.t_end.index_select(0, rows)).first_samples(SAMPLES_MARCHED)
+        active = replace(
+            active,
+            t=active.t.index_copy(0, rows, found.t),
+            count=active.count.index_copy(0, rows, found.counts),
+            next=active.next.masked_fill(is_used_up, 0),
+            t_end=active.t_end.index_copy(0, rows, found.ends),
+        )
+        active = active.select(active.count.nonzero()[:, 0])
+
+        # The next samples of each ray are evaluated, and neighbours merged.
+        evaluated = torch.minimum(active.wanted, active.count - active.next)
+        firsts = torch.arange(len(active.rays), device=none.device) * SAMPLES_MARCHED + active.next
+        owners, rows, info = packed_rows(firsts, evaluated)
+        t, rays = active.t.view(-1).index_select(0, rows), active.rays.index_select(0, owners)
+        positions = torch.addcmul(origins.index_select(0, rays), directions.index_select(0, rays), t[:, None])
+        densities, features = field.density_of(field.encode(positions))
+        merged = merge_samples(densities * limits.step, t, features, info, active.transmittance, limits)
+
+        # What they look like is added to their rays.
+        rays = active.rays.index_select(0, merged.ray_indices)
+        starts, along = origins.index_select(0, rays), directions.index_select(0, rays)
+        positions = torch.addcmul(starts, along, merged.t[:, None])
+        light = None if renderer.opaque_skips is None else renderer.lamplight(field, starts, positions)
+        values = coefficients_of(merged.t, field.get_outputs(positions, along, merged.features, light))
+        if num_endmembers == 0:
+            num_endmembers = values.num_endmembers
+            totals = values.packed.new_zeros(len(origins), values.packed.shape[1])
+            last = torch.zeros_like(totals) if renderer.residual_on_last_sample else last
+        totals.index_add_(0, active.rays, accumulate(merged.weights, values.packed, merged.packed_info))
+        if renderer.residual_on_last_sample:
             rows = merged.packed_info[:, 1].nonzero()[:, 0]
-            last[active.rays[rows]] = values[merged.packed_info[rows].sum(dim=1) - 1]
-        active = active.behind(merged.transmittance, smallest)
-    if last is not None:
+            last[active.rays[rows]] = values.packed[merged.packed_info[rows].sum(dim=1) - 1]
+
+        # Rays end that have no light left, or no samples. Of others so many more are wanted as would take their light.
+        enough = evaluated / _DENSER * (merged.transmittance / smallest).log()
+        enough /= (active.transmittance / merged.transmittance).log()
+        enough = enough.ceil().nan_to_num(nan=torch.inf)  # no number if both logarithms are infinite
+        num_evaluated = active.num_evaluated + evaluated
+        wanted = torch.minimum(enough, num_evaluated.clamp(min=at_first)).clamp(min=fewest).long()
+        position = active.next + evaluated
+        may_have_more = (position < active.count) | (active.count == SAMPLES_MARCHED)
+        goes_on = (merged.transmittance > smallest) & may_have_more
+        active = replace(
+            active,
+            transmittance=merged.transmittance,
+            wanted=wanted,
+            num_evaluated=num_evaluated,
+            next=position,
+        ).select(goes_on.nonzero()[:, 0])
+        if len(pending) == 0 and len(active.rays) == 0:
+            break
+    if renderer.residual_on_last_sample:
         totals = totals + (1 - totals[:, :1]) * last
-    return Coefficients(totals, nothing.num_endmembers)
-
-
-def _evaluate(
-    field: CoefficientField, ray_bundle: RayBundle, active: _ActiveRays, limits: MergeLimits
-) -> MergedSamples:
-    """The next samples of rays, merged."""
-    firsts = torch.arange(len(active), device=active.next.device) * SAMPLES_MARCHED + active.next
-    owners, rows, info = packed_rows(firsts, active.next_counts())
-    t = active.t.view(-1).index_select(0, rows)
-    origins, along = _lines(ray_bundle, active.rays.index_select(0, owners))
-    densities, features = field.density_of(field.encode(torch.addcmul(origins, along, t[:, None])))
-    return merge_samples(densities * limits.step, t, features, info, active.transmittance, limits)
-
-
-def _coefficients(
-    renderer: VolumeRenderer,
-    field: CoefficientField,
-    lines: tuple[Float[Tensor, "S 3"], Float[Tensor, "S 3"]],
-    t: Float[Tensor, "S"],
-    features: Float[Tensor, "S G"],
-) -> Coefficients:
-    """What opaque samples on these lines look like."""
-    origins, along = lines
-    positions = torch.addcmul(origins, along, t[:, None])
-    light = renderer.lamplight(field, origins, positions)
-    return coefficients_of(t, field.get_outputs(positions, along, features, light))
-
-
-def _lines(
-    ray_bundle: RayBundle, rays: Int[Tensor, "S"]
-) -> tuple[Float[Tensor, "S 3"], Float[Tensor, "S 3"]]:
-    """Origins and directions of some rays."""
-    return ray_bundle.origins.index_select(0, rays), ray_bundle.directions.index_select(0, rays)
+    return Coefficients(totals, num_endmembers)

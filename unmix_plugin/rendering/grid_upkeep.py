@@ -55,7 +55,7 @@ def update_grid(
         if values is not None:
             processes.reduce(values, "max")
     space = renderer.space
-    begins_coarsely = renderer.is_unbounded and progress < _FIRST_CELLS_UNTIL
+    begins_coarsely = renderer.space.is_unbounded and progress < _FIRST_CELLS_UNTIL
     grid.update(
         lambda points: field.get_density(space.from_unit(points))[0],
         threshold=occupied_density(renderer, max(grid.occupied.shape)),

@@ -22,8 +22,7 @@ from unmix_plugin.engine.geometry.space import RayBundle, SceneBox, UnitSpace
 from unmix_plugin.field import CoefficientField
 from unmix_plugin.light.shading import FINEST, Lamplight, ShadowDetail, lamplight
 from unmix_plugin.operators.compositing import accumulate, scale_gradient, volume_weights
-from unmix_plugin.operators.contracted_marching import rays_in_world
-from unmix_plugin.operators.marching import GridRays, PackedSamples, packed_rows, rays_in_box
+from unmix_plugin.operators.marching import GridRays, PackedSamples, packed_rows, rays_in_box, rays_in_world
 from unmix_plugin.operators.occupancy import cells_at
 from unmix_plugin.spectral.materials import Coefficients
 
@@ -83,7 +82,7 @@ def visible_samples(
         rays, chosen, _ = packed_rows(starts + first, wanted)
         if len(chosen) == 0 and evaluated:
             break
-        positions, _ = points_of(samples.rows(chosen), ray_bundle)
+        positions, _ = points_of(ray_bundle, rays, samples.t.index_select(0, chosen))
         encoded = field.encode(positions)
         densities, features = field.density_of(encoded)
         evaluated.append(EvaluatedSamples(positions, encoded, densities, features))
@@ -97,14 +96,12 @@ def visible_samples(
 
 
 def points_of(
-    samples: PackedSamples, ray_bundle: RayBundle
+    ray_bundle: RayBundle, ray_indices: Int[Tensor, "S"], t: Float[Tensor, "S"]
 ) -> tuple[Float[Tensor, "S 3"], Float[Tensor, "S 3"]]:
     """Positions of samples and the directions they are seen along."""
     # index_select: a third of the time of indexing by a tensor, and this is done for every sample.
-    origins, along = (
-        x.index_select(0, samples.ray_indices) for x in (ray_bundle.origins, ray_bundle.directions)
-    )
-    return origins + samples.t[:, None] * along, along
+    origins, along = (x.index_select(0, ray_indices) for x in (ray_bundle.origins, ray_bundle.directions))
+    return origins + t[:, None] * along, along
 
 
 _SPARSE_DEPTH = 0.03
@@ -143,8 +140,9 @@ class RenderedRays:
 class VolumeRenderer:
     """Volume renderer of a field's coefficients: pure functions of its values, the field and the rays."""
 
-    box: SceneBox
-    """What is rendered, model space."""
+    space: UnitSpace
+    """What is rendered, and where the cells of the grid lie: a box, or a world in which rays go on outside of it,
+    through contracted space, and end on the sky."""
     skips: UInt8[Tensor, "X Y Z"]
     """0 in the cells of the box that rays are sampled in; others are empty, and have what `skip_distances` says."""
     reachable: Bool[Tensor, "X Y Z"]
@@ -153,8 +151,6 @@ class VolumeRenderer:
     """Distance of samples, model units; larger outside the box of a world without end."""
     smallest_weight: float
     """Samples that contribute less are left out."""
-    is_unbounded: bool = False
-    """Whether rays go on outside the box, through contracted space, and end on the sky."""
     residual_on_last_sample: bool = False
     """Whether the last sample of a ray takes all the light that is left."""
     rays_per_chunk: int = 32_768
@@ -175,7 +171,7 @@ class VolumeRenderer:
             field, samples, ray_bundle, step=self.step, smallest_weight=self.smallest_weight
         )
         kept = seen.samples
-        positions, along = points_of(kept, ray_bundle)
+        positions, along = points_of(ray_bundle, kept.ray_indices, kept.t)
         if torch.is_grad_enabled():
             encoded = seen.of([part.encoded for part in seen.evaluated])
             densities, features = field.density_of(field.encode(positions, encoded))
@@ -183,10 +179,12 @@ class VolumeRenderer:
             densities = seen.of([part.densities for part in seen.evaluated])
             features = seen.of([part.features for part in seen.evaluated])
 
-        origins = ray_bundle.origins.index_select(0, kept.ray_indices)
-        light = self.lamplight(field, origins, positions, generator)
+        light = None
+        if self.opaque_skips is not None:
+            origins = ray_bundle.origins.index_select(0, kept.ray_indices)
+            light = self.lamplight(field, origins, positions, generator)
         outputs = field.get_outputs(positions, along, features, light)
-        if self.is_unbounded:
+        if self.space.is_unbounded:
             # What is near a camera fills more of its pixels than what is far, so it would learn faster, and from one
             # view alone. Source: Philip and Deschaintre 2023, Floaters No More.
             near = (kept.t / self.space.half_edge).square().clamp(max=1.0)
@@ -201,8 +199,10 @@ class VolumeRenderer:
             starts, counts = kept.packed_info.unbind(-1)
             last = values.packed.index_select(0, (starts + counts - 1).clamp(min=0))
             totals = totals + torch.where(counts > 0, 1 - totals[:, 0], 0.0)[:, None] * last
-        foreground = Coefficients(totals, values.num_endmembers)
-        coefficients, mixtures = before_sky(foreground, field.sky(ray_bundle))
+        coefficients, sky = Coefficients(totals, values.num_endmembers), field.sky(ray_bundle)
+        coefficients, mixtures = (
+            (coefficients, coefficients.abundances) if sky is None else coefficients.before(sky)
+        )
 
         num_rays = max(len(ray_bundle), 1)
         mean_log = outputs["abundances"].clamp(min=_SMALLEST_SHARE).log().mean(dim=1)
@@ -245,9 +245,9 @@ class VolumeRenderer:
         return self.space.contains(positions) & cells[cells_at(unit, cells.shape).unbind(-1)]
 
     @property
-    def space(self) -> UnitSpace:
-        """Where the cells of the grid lie."""
-        return UnitSpace(self.box, self.is_unbounded)
+    def box(self) -> SceneBox:
+        """That of the scene, model space."""
+        return self.space.box
 
     def lamplight(
         self,
@@ -274,7 +274,7 @@ class VolumeRenderer:
         jitter = torch.full_like(behind, 0.5)
         if generator is not None:
             jitter = torch.rand(jitter.shape, generator=generator, device=generator.device).to(jitter)
-        if self.is_unbounded:
+        if self.space.is_unbounded:
             starts, along = self.space.centred(origins), directions / self.space.half_edge
             return rays_in_world(starts, along, behind, jitter, self.skips, self.step)
         t_near, t_far = self.box.intersect(origins, directions)
@@ -284,16 +284,6 @@ class VolumeRenderer:
 
 def coefficients_of(t: Float[Tensor, "S"], outputs: Mapping[str, Tensor]) -> Coefficients:
     """Those of opaque samples at these distances, of which a field says this."""
-    names = ("abundances", "scaled_abundances", "specular_coefficients")
-    return Coefficients.of(torch.ones_like(t), t, *(outputs[name] for name in names))
-
-
-def before_sky(
-    foreground: Coefficients, sky: Float[Tensor, "R C"] | None
-) -> tuple[Coefficients, Float[Tensor, "R K"]]:
-    """With the light of what is infinitely far away, as `CoefficientField.sky` gives it; and abundances with its."""
-    if sky is None:
-        return foreground, foreground.abundances
-    transmittance = (1 - foreground.accumulation)[:, None]
-    mixtures = foreground.abundances + transmittance * sky[:, :-1]
-    return foreground.with_light(transmittance * sky[:, -1:] * sky[:, :-1]), mixtures
+    values = [outputs[name] for name in ("abundances", "scaled_abundances", "specular_coefficients")]
+    packed = torch.cat([torch.ones_like(t)[:, None], t[:, None], *values], dim=-1)
+    return Coefficients(packed, values[0].shape[-1])

@@ -12,6 +12,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Literal
 
 import numpy as np
@@ -90,12 +91,14 @@ class Coefficients:
         """Rays that show a material."""
         return self.accumulation > OCCUPIED_ACCUMULATION
 
-    def with_light(self, scaled_abundances: Float[Tensor, "*rays K"]) -> Coefficients:
-        """The same with more light of that mixture, and no more opacity."""
+    def before(self, sky: Float[Tensor, "*rays C"]) -> tuple[Coefficients, Float[Tensor, "*rays K"]]:
+        """With the light of what is infinitely far away, K abundances and their factor, and no more opacity; and the
+        abundances of all that is seen, the sky's among them."""
         first = 2 + self.num_endmembers
+        transmittance = (1 - self.packed[..., 0])[..., None]
         packed = self.packed.clone()
-        packed[..., first : first + self.num_endmembers] += scaled_abundances
-        return replace(self, packed=packed)
+        packed[..., first : first + self.num_endmembers] += transmittance * sky[..., -1:] * sky[..., :-1]
+        return replace(self, packed=packed), self.packed[..., 2:first] + transmittance * sky[..., :-1]
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Coefficients:
         """The same after a change of leading axes, device or dtype."""
@@ -134,6 +137,7 @@ def seen_reflectance(
 SegmentationMethod = Literal["abundances", "probe"]
 
 
+@cache
 def default_names(count: int) -> tuple[str, ...]:
     """Names of materials of which no colour is known.
 
@@ -245,7 +249,8 @@ class Materials:
 
     def spectra(self, coefficients: Coefficients) -> Float[Tensor, "*rays B"]:
         """Spectra seen along the rays, on black."""
-        return self.diffuse(coefficients) + self.specular(coefficients)
+        diffuse = coefficients.scaled_abundances @ self.endmembers
+        return diffuse + coefficients.specular @ self.specular_spectra
 
     def through(
         self,

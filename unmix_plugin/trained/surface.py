@@ -112,7 +112,7 @@ class SeenSurface:
         rays = view.image_rays(0)
         positions = rays.at(distances)
         solid = accumulation >= _SOLID_ACCUMULATION
-        if self._scene.renderer.is_unbounded:  # a horizon would dwarf everything else
+        if self._scene.renderer.space.is_unbounded:  # a horizon would dwarf everything else
             solid &= self._scene.scene_box.to("cpu").contains(positions)
         self._points.append(SurfacePoints(positions[solid], rays.directions[solid], *_shares(found, solid)))
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -147,7 +148,12 @@ class UnitSpace:
     is_unbounded: bool = False
     """Whether the cube holds all of space, contracted around the box's centre, or the box alone."""
 
-    @property
+    @cached_property
+    def centre(self) -> Float[Tensor, "3"]:
+        """Middle of the box, model units."""
+        return self.box.aabb.mean(dim=0)
+
+    @cached_property
     def half_edge(self) -> Float[Tensor, ""]:
         """Half of the box's longest edge, model units: what r = 1 is."""
         return self.box.size.max() / 2
@@ -159,7 +165,7 @@ class UnitSpace:
 
     def centred(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
         """Coordinates u."""
-        return (points - self.box.aabb.mean(dim=0)) / self.half_edge
+        return (points - self.centre) / self.half_edge
 
     def to_unit(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
         """Model space to the unit cube."""
@@ -171,7 +177,7 @@ class UnitSpace:
         """The inverse of `to_unit`."""
         if not self.is_unbounded:
             return points * self.box.size + self.box.aabb[0]
-        return uncontract((points - 0.5) * _SPAN) * self.half_edge + self.box.aabb.mean(dim=0)
+        return uncontract((points - 0.5) * _SPAN) * self.half_edge + self.centre
 
     def contains(self, points: Float[Tensor, "*points 3"]) -> Tensor:
         """Points that are modelled: those in the box, or all; bool (*points)."""
