@@ -15,6 +15,7 @@ from tests.engine.conftest import (  # noqa: F401 (fixtures)
 )
 from tests.factories.commands import done, refused, run
 from tests.factories.rgb_nerf import RgbNerf, RgbNerfConfig
+from unmix_plugin.commands.compare import compare
 from unmix_plugin.commands.eval import evaluate
 from unmix_plugin.commands.export import export
 from unmix_plugin.commands.render import render
@@ -49,6 +50,7 @@ def test_what_needs_endmembers_is_refused_in_one_sentence(ball_run, tmp_path):
         assert "the method rgb-nerf makes no scene of mixed materials" in refused(
             export, *words, "--run", ball_run, "--output", tmp_path / "out", "--device", "cpu"
         )
+    assert "makes no scene of mixed materials" in refused(compare, ball_run, ball_run, "--device", "cpu")
     refused(evaluate, "--run", ball_run, "--illuminant", "A", "--device", "cpu")
 
 

@@ -229,8 +229,10 @@ def _compared(
     means = [Moments.of(one).mean for one in values]
     counts = [np.isfinite(one[..., 0]).sum(axis=0) for one in values]
     both = (counts[0] > 0) & (counts[1] > 0)
-    if not both.any():
-        raise ConfigError("no place of the first surface is seen by views of both captures")
+    if not (np.minimum(*counts) >= LEAST_SEEN).any():
+        raise ConfigError(
+            f"no place of the first surface is seen by at least {LEAST_SEEN} views of both captures; take more views"
+        )
     light = light_between(means[0][both], means[1][both], surface.areas[both], registration.light)
     registration = replace(registration, light=light)
     values[1] = (values[1] / light).astype(np.float32)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Float64, Int64, Shaped
 from scipy import stats
 
 from unmix_plugin.comparing.captured import Surface
@@ -24,6 +24,11 @@ _SMALLEST_PX, _SMALLEST_BY_DISTANCE_PX = 4.0, 100.0
 errors of distances reach about so far, unless the distance is clear: a hundredth of the level."""
 _LARGEST_HOLE_PX = 30.0
 """Area of what lies within a place and belongs to it."""
+_EDGE, _EDGE_RINGS = 0.5, 2
+"""Part of the strongest change of spectra nearby, below which a vertex is beside a place: pixels blur its edge, and an
+edge is where half of the change is there; and how many neighbours away pixels reach."""
+_CLOSED_RINGS = 2
+"""Neighbours that a gap in a place is wide at most, as differences of distances are no finer."""
 _CONFIDENCE = 0.95
 
 
@@ -81,7 +86,12 @@ def find_places(
     vertices."""
     q = adjusted(p)
     seeds = is_significant(q, level)
-    grown = seeds | is_significant(p, _GROWING_P)
+    edges = surface.faces[:, [0, 1, 1, 2, 2, 0, 1, 0, 2, 1, 0, 2]].reshape(-1, 2)
+    relative = np.linalg.norm(means[1] - means[0], axis=1) / np.linalg.norm(means[0], axis=1).clip(min=1e-12)
+    relative = np.nan_to_num(relative)
+    within = relative >= _EDGE * _most_nearby(relative, edges, _EDGE_RINGS)
+    within |= is_significant(differences["distance"].p, _GROWING_P)
+    grown = (seeds | is_significant(p, _GROWING_P)) & within
     by_spectra = is_significant(
         adjusted(any_of([differences["spectrum"].p, differences["brightness"].p])), level
     )
@@ -92,6 +102,8 @@ def find_places(
         is_seen = areas[(by_spectra | by_clear_distance)[vertices]].sum() >= _SMALLEST_PX
         if seeds[vertices].any() and (is_seen or areas.sum() >= _SMALLEST_BY_DISTANCE_PX):
             changed[vertices] = True
+    changed = ~_most_nearby(~_most_nearby(changed, edges, _CLOSED_RINGS), edges, _CLOSED_RINGS)
+    changed &= np.isfinite(p)
     for hole in _pieces(surface, ~changed):
         if surface.areas[hole].sum() <= _LARGEST_HOLE_PX * pixel**2:
             changed[hole] = np.isfinite(p[hole])
@@ -102,6 +114,17 @@ def find_places(
         for number, vertices in enumerate(found, start=1)
     ]
     return tuple(places), changed
+
+
+def _most_nearby(
+    values: Shaped[np.ndarray, " P"], edges: Int64[np.ndarray, "E 2"], rings: int
+) -> Shaped[np.ndarray, " P"]:
+    """The largest of each vertex and its neighbours, and of theirs, so many times."""
+    for _ in range(rings):
+        largest = values.copy()
+        np.maximum.at(largest, edges[:, 0], values[edges[:, 1]])
+        values = largest
+    return values
 
 
 def _pieces(surface: Surface, chosen: Bool[np.ndarray, " P"]) -> list[Int64[np.ndarray, " n"]]:
