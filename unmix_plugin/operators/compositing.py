@@ -10,6 +10,7 @@ Of the kernels a work item is a ray, so no two items share an address. Rows and 
 they are looped over: an index that counts up from 0 needs no code for negative ones.
 """
 
+from functools import cache
 from typing import Any, no_type_check
 
 import torch
@@ -17,7 +18,7 @@ import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from unmix_plugin.operators.launching import launch
+from unmix_plugin.operators.launching import declare, launch
 
 
 def volume_weights(optical_depths: Float[Tensor, "S"], packed_info: Int[Tensor, "R 2"]) -> Float[Tensor, "S"]:
@@ -57,6 +58,7 @@ def accumulate_twin(
 class _VolumeWeights(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, optical_depths: Tensor, packed_info: Tensor) -> Tensor:
+        _declare_kernels(optical_depths.dtype)
         weights, transmittances = torch.empty_like(optical_depths), torch.empty_like(optical_depths)
         arrays = [optical_depths, packed_info, weights, transmittances]
         launch(_weights_kernel, len(packed_info), arrays, packed_info.device)
@@ -76,6 +78,7 @@ class _VolumeWeights(torch.autograd.Function):
 class _Accumulate(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, weights: Tensor, values: Tensor, packed_info: Tensor) -> Tensor:
+        _declare_kernels(values.dtype)
         totals = values.new_empty(len(packed_info), values.shape[1])
         launch(_accumulate_kernel, len(packed_info), [weights, values, packed_info, totals], totals.device)
         ctx.save_for_backward(weights, values, packed_info)
@@ -90,6 +93,16 @@ class _Accumulate(torch.autograd.Function):
         arrays = [weights, values, packed_info, incoming, weight_gradients, value_gradients]
         launch(_accumulate_gradient_kernel, len(packed_info), arrays, packed_info.device)
         return weight_gradients, value_gradients, None
+
+
+@cache
+def _declare_kernels(dtype: torch.dtype) -> None:
+    number = wp.dtype_from_torch(dtype)
+    vector, matrix, info = (number, 1), (number, 2), (wp.int64, 2)
+    declare(_weights_kernel, vector, info, vector, vector)
+    declare(_weights_gradient_kernel, vector, vector, info, vector, vector)
+    declare(_accumulate_kernel, vector, matrix, info, matrix)
+    declare(_accumulate_gradient_kernel, vector, matrix, info, matrix, vector, matrix)
 
 
 _OPAQUE = wp.constant(1e-20)

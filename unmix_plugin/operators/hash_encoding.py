@@ -24,7 +24,7 @@ import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from unmix_plugin.operators.launching import as_warp, launch, vector_type
+from unmix_plugin.operators.launching import as_warp, declare, launch, vector_type
 
 
 @dataclass(frozen=True)
@@ -111,6 +111,17 @@ def _levels_on(layout: HashGridLayout, device: torch.device) -> Int[Tensor, "L 3
     return layout.levels.to(device)
 
 
+@cache
+def _vectors(positions: torch.dtype, table: torch.dtype, width: int) -> tuple[Any, Any]:
+    """Warp's types of a position and of the features of a level; the kernels are declared for them."""
+    point, features = vector_type(3, positions), vector_type(width, table)
+    points, rows, levels, encoded = (point, 1), (features, 1), (wp.int32, 2), (features, 2)
+    declare(_encode_kernel, points, rows, levels, encoded)
+    declare(_table_gradient_kernel, points, encoded, levels, rows)
+    declare(_position_gradient_kernel, points, rows, encoded, levels, points)
+    return point, features
+
+
 class _HashEncode(torch.autograd.Function):
     @staticmethod
     def forward(
@@ -123,7 +134,7 @@ class _HashEncode(torch.autograd.Function):
             return known.view_as(known)
         num_samples, num_levels = len(positions), layout.num_levels
         encoded = positions.new_empty(num_samples, num_levels * ctx.width)
-        point, features = vector_type(3, positions.dtype), vector_type(ctx.width, table.dtype)
+        point, features = _vectors(positions.dtype, table.dtype, ctx.width)
         rows = encoded.view(num_samples, num_levels, ctx.width)
         arrays = [as_warp(positions, point), as_warp(table, features), levels, as_warp(rows, features)]
         launch(_encode_kernel, num_samples * num_levels, arrays, positions.device)
@@ -134,7 +145,7 @@ class _HashEncode(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor | None, None, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
         positions, table, levels = ctx.saved_tensors
         num_samples, num_levels = len(positions), len(levels)
-        point, features = vector_type(3, positions.dtype), vector_type(ctx.width, table.dtype)
+        point, features = _vectors(positions.dtype, table.dtype, ctx.width)
         incoming = as_warp(gradients[0].contiguous().view(num_samples, num_levels, ctx.width), features)
         table_gradient = position_gradient = None
         if ctx.needs_input_grad[1]:

@@ -113,6 +113,17 @@ def as_warp(tensor: torch.Tensor, dtype: Any = None) -> KernelArray:
     return KernelArray(descriptor, _array_type(dtype, tensor.dim() - is_vector))
 
 
+def declare(kernel: Any, *arrays: tuple[Any, int]) -> None:
+    """Have a generic kernel compiled together with the others of its module: for each that Warp meets later it compiles
+    all of the module anew, which takes a second.
+
+    Args:
+        arrays: The type of a number or vector, and the number of axes, of each argument.
+    """
+    with _PACKING:
+        _specialised(kernel, tuple(_array_type(dtype, ndim) for dtype, ndim in arrays))
+
+
 def launch(
     kernel: Any,
     size: int,
