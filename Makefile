@@ -56,16 +56,16 @@ $(VENV)/.installed-dev: $(VENV)/.installed
 demo: $(VENV)/.installed
 	$(BIN)/unmix-demo --seconds $(DEMO_SECONDS)
 
-# A browser, where it can be had; tried once.
+# A browser, which only slow tests use, where it can be had; tried once.
 $(VENV)/.system-packages: scripts/install_system_packages.sh | $(BIN)/python
 	@scripts/install_system_packages.sh
 	@touch $@
 
-test: $(VENV)/.installed-dev $(VENV)/.system-packages
+test: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest --numprocesses 2 -m "not slow"
 
 # As `make test`, and how many lines of the package the tests reach; kernels, which run elsewhere, count as not reached.
-coverage: $(VENV)/.installed-dev $(VENV)/.system-packages
+coverage: $(VENV)/.installed-dev
 	$(INSTALL) pytest-cov
 	$(BIN)/python -m pytest --numprocesses 2 -m "not slow" --cov unmix_plugin --cov-report term:skip-covered
 

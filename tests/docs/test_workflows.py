@@ -54,7 +54,9 @@ def test_every_run_of_the_tests_is_also_one_of_ci():
     }
     assert {"make lint", "make test-all", "bash .ci/run", "bash .ci/release"} <= lines
     called = set(re.findall(r"^make .*?(?= \|\||$)", text_of(".ci/run"), re.MULTILINE))
-    assert called == {"make lint", "make test-all"}
+    assert called == {"make lint", "make test"}
+    assert "make test-all" in text_of(".ci/release")
+    assert "`make test`" in text_of("README.md")
     [repository] = yaml.safe_load(text_of(".pre-commit-config.yaml"))["repos"]
     assert [fault_of(hook["entry"]) for hook in repository["hooks"]] == [None]
 
