@@ -35,7 +35,7 @@ from unmix_plugin.engine.model import (
 from unmix_plugin.engine.runs.replacing import foreign, move_aside
 from unmix_plugin.field import FieldSpace, GridField, PublishedField, UnmixField
 from unmix_plugin.light.lamp import Lamp
-from unmix_plugin.light.shading import ShadowDetail
+from unmix_plugin.light.shading import FINEST, ShadowDetail
 from unmix_plugin.losses.abundance_guide import AbundanceGuide, first_endmembers, first_specular_spectra
 from unmix_plugin.losses.terms import (
     BatchComparison,
@@ -472,13 +472,13 @@ class UnmixModel(Model):
     @property
     def _training_renderer(self) -> VolumeRenderer:
         """That of the present training step: samples may be farther apart, and shadows softer, than in the end."""
-        config, progress = self.config.renderer, self._progress
+        config, progress, renderer = self.config.renderer, self._progress, self.renderer
         smallest = config.first_smallest_weight if progress < _FIRST_PART else config.smallest_weight
         return replace(
-            self.renderer,
+            renderer,
             step=self.step * self._coarseness(progress),
             smallest_weight=float(smallest),
-            shadow_detail=ShadowDetail.at(progress),
+            shadow_detail=FINEST if renderer.opaque_skips is None else ShadowDetail.at(progress),
         )
 
     def _coarseness(self, progress: float) -> float:

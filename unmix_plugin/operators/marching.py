@@ -78,7 +78,8 @@ class GridRays:
     def first_samples(self, most: int) -> FirstSamples:
         """At most so many samples of each ray by one launch, which writes them where there is room for as many. Raises
         ValueError: step isn't positive."""
-        _check_step(self.step)
+        if not self.step > 0:
+            raise ValueError(f"step must be positive; got {self.step}")
         num_rays, point = len(self.lines[0]), vector_type(3, torch.float32)
         t = self.lines[0].new_empty(num_rays, most, dtype=torch.float32)
         ends, counts = t.new_empty(num_rays), torch.empty(num_rays, dtype=torch.int64, device=t.device)
@@ -149,7 +150,6 @@ def march_twin(
     step: float,
 ) -> PackedSamples:
     """`rays_in_box(...).samples()` in plain PyTorch: tests every lattice point of every ray."""
-    _check_step(step)
     t_first = t_near + jitter * step
     longest = float((t_far - t_first).max()) if len(t_far) else 0.0
     index = torch.arange(max(int(longest / step) + 2, 1), device=origins.device)
@@ -165,12 +165,6 @@ def packed_where(hit: Bool[Tensor, "R M"], t: Float[Tensor, "R M"]) -> PackedSam
     counts = hit.sum(dim=1)
     info = torch.stack([counts.cumsum(0) - counts, counts], dim=-1)
     return PackedSamples(t[hit], hit.nonzero()[:, 0], info)
-
-
-def _check_step(step: float) -> None:
-    """Refuse a distance of samples that isn't positive."""
-    if not step > 0:
-        raise ValueError(f"step must be positive; got {step}")
 
 
 _NEAR = wp.constant(2)
@@ -313,7 +307,6 @@ def march_contracted_twin(
     step: float,
 ) -> PackedSamples:
     """`rays_in_world(...).samples()` in plain PyTorch: walks all rays at once."""
-    _check_step(step)
     t = t_start
     found: list[tuple[Tensor, Tensor]] = []
     while True:

@@ -64,12 +64,13 @@ class MeasuredPixels:
 def to_batch(parts: Sequence[MeasuredPixels]) -> dict[str, Tensor]:
     """The engine's batch of some pixels; those of a rig have numbers of sensors."""
     most = max(part.spectra.shape[1] for part in parts)
-    padded = [torch.nn.functional.pad(part.spectra, (0, most - part.spectra.shape[1])) for part in parts]
-    batch = {"spectra": torch.cat(padded)}
-    for name in _COLUMNS:
+    batch: dict[str, Tensor] = {}
+    for name in ("spectra", *_COLUMNS):
         columns = [getattr(part, name) for part in parts]
+        if name == "spectra" and len(parts) > 1:
+            columns = [torch.nn.functional.pad(each, (0, most - each.shape[1])) for each in columns]
         if columns[0] is not None:
-            batch[name] = torch.cat(columns)
+            batch[name] = columns[0] if len(parts) == 1 else torch.cat(columns)
     sensors = [part.sensor for part in parts if part.sensor is not None]
     if sensors:
         batch["sensors"] = torch.tensor(sensors)

@@ -53,6 +53,8 @@ class RayBundle:
     @staticmethod
     def join(bundles: Sequence[RayBundle]) -> RayBundle:
         """The rays of several bundles that know the same of their rays, one after the other."""
+        if len(bundles) == 1:
+            return bundles[0]
         columns = zip(*(bundle._columns() for bundle in bundles), strict=True)
         joined: list[Any] = [None if column[0] is None else torch.cat(column) for column in columns]
         return RayBundle(*joined)
