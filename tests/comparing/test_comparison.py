@@ -79,6 +79,18 @@ def test_more_of_a_material_is_found_where_it_is_and_by_how_much(stained, surfac
     assert 0.1 < amount.mean < 0.3
 
 
+def test_a_stain_with_a_blurred_edge_ends_where_half_of_it_is_there(surface, cosines):
+    part = np.clip((cosines - 0.83) / 0.1, 0.0, 1.0)[:, None]
+    found = compare(
+        capture(surface),
+        later(replace(surface, spectra=surface.spectra + 0.4 * part * (CHALK - surface.spectra))),
+    )
+    areas, part = surface.areas, part[:, 0]
+    assert areas[found.changed & (part > 0.75)].sum() > 0.95 * areas[part > 0.75].sum()
+    beside = (part > 0.0) & (part < 0.25)
+    assert areas[found.changed & beside].sum() < 0.25 * areas[beside].sum()
+
+
 def test_a_dent_is_found_along_the_normal(surface, spot):
     dented = replace(surface, positions=surface.positions - 2.0 * PIXEL * surface.normals * spot[:, None])
     found = compare(capture(surface), later(dented))

@@ -30,6 +30,14 @@ def test_false_alarms_of_an_unchanged_pair_are_nominal(nominal):
     assert 0.85 < found.widening < 1.15
 
 
+def test_false_alarms_are_as_rare_at_loud_places_as_at_quiet_ones():
+    loudness = np.exp(np.random.default_rng(7).normal(size=(3000, 1)))
+    found = difference(loudness * views(0), loudness * views(1))
+    quiet = loudness[:, 0] < np.quantile(loudness, 0.3)
+    for part in (quiet, loudness[:, 0] > np.quantile(loudness, 0.7)):
+        assert 0.01 < (found.p[part] <= 0.05).mean() < 0.09
+
+
 def test_an_error_that_is_the_same_in_all_views_of_a_capture_widens():
     shift = 0.6 * np.random.default_rng(5).normal(size=(1, 3000, 2))
     found = difference(views(0), views(1) + shift)
