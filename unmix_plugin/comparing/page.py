@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from unmix_plugin.comparing.comparison import Comparison
+from unmix_plugin.comparing.comparison import TESTED, Comparison
 from unmix_plugin.comparing.printed import amount_in_words
 from unmix_plugin.comparing.shown import ChangeMap, ShownView, strip
 from unmix_plugin.errors import counted
@@ -62,6 +62,7 @@ def _rows(comparison: Comparison) -> list[dict[str, str | int]]:
         {
             "number": place.number,
             "what": place.what,
+            "map": TESTED.index(place.what),  # `change_maps` begins with maps of these
             "area": describe_area(place.area, comparison.before.scale),
             "center": ", ".join(f"{value:.3g}" for value in place.center),
             "amount": amount_in_words(comparison, place.number),
