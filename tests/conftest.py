@@ -35,6 +35,15 @@ def no_wait_for_the_disk():
         yield
 
 
+@pytest.fixture(scope="module")
+def coarse_hulls():
+    """Hulls that decide how large a scene is, and whether masks agree, of cells as small pictures need them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("unmix_plugin.scenes.geometry.bounds._HULL_CELLS", 32)
+        patch.setattr("unmix_plugin.scenes.geometry.carving._WITNESS_CELLS", 32)
+        yield
+
+
 @pytest.fixture
 def contact_sheet():
     """For tests that want the contact sheet of the scenes that they write."""

@@ -4,8 +4,8 @@ import pytest
 
 
 @pytest.fixture(autouse=True, scope="module")
-def nothing_is_forced_to_disk(no_wait_for_the_disk):
-    """Of the scenes and captures here, of which most are looked at once."""
+def quick_scenes(no_wait_for_the_disk, coarse_hulls):
+    """Nothing is forced to disk of the scenes and captures here, of which most are looked at once."""
 
 
 @pytest.fixture(autouse=True)

@@ -87,7 +87,9 @@ def test_a_fisheye_read_as_a_pinhole_does_not_fit_its_lens(tmp_path):
     assert "do not fit their lens" in checked(make_views(tmp_path, straighten, bumps()))[1][0]
 
 
-@pytest.mark.parametrize("name", REPEATED)
+@pytest.mark.parametrize(
+    "name", [name if "print" in name else pytest.param(name, marks=pytest.mark.slow) for name in REPEATED]
+)
 def test_patterns_that_repeat_speak_against_no_poses(tmp_path, name):
     """Squares and stripes match each other at one period's distance in all views alike."""
     texture = ndimage.gaussian_filter(REPEATED[name], 1.0)

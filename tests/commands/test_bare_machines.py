@@ -51,11 +51,14 @@ def test_figures_need_no_font_of_the_system_and_say_once_that_theirs_lacks_lette
         "fontManager.ttflist = []\n"
         "for path in Path(matplotlib.get_data_path(), 'fonts/ttf').glob('*.ttf'): fontManager.addfont(path)"
     )
-    draw = DRAW + "f.text(0, 0, 'Bl\u00e4tter \u03b1 {}'); figure_bytes(f)"
-    assert ended(draw.format(""), tmp_path, alone).stderr == ""
-    end = ended(draw.format("\u8449\u679c"), tmp_path, alone, PYTHONIOENCODING="utf-8")
+    draw = "f.text(0, 0, 'Bl\u00e4tter \u03b1 {}'); figure_bytes(f); "
+    drawn = (
+        DRAW + draw.format("") + "import sys; print('then', file=sys.stderr); " + draw.format("\u8449\u679c")
+    )
+    end = ended(drawn, tmp_path, alone, PYTHONIOENCODING="utf-8")
     assert end.returncode == 0
-    [line] = end.stderr.splitlines()
+    [first, line] = end.stderr.splitlines()
+    assert first == "then"
     assert line.startswith("warning: figures have boxes in place of letters such as \u8449")
     assert "Rename" in line
 

@@ -127,8 +127,8 @@ def metrics(folder):
     return json.loads((folder / "metrics.json").read_text())
 
 
-def test_an_edited_run_is_evaluated_into_a_folder_of_its_own(run_copy, recipe):
-    done(evaluate, "--run", run_copy, "--device", "cpu")
+def test_an_edited_run_is_evaluated_into_a_folder_of_its_own(evaluated, tmp_path, recipe):
+    run_copy = Path(shutil.copytree(evaluated[0], tmp_path / "run"))
     before = metrics(run_copy / "eval")
     ended = done(evaluate, "--run", run_copy, "--edits", recipe, "--device", "cpu")
     assert metrics(run_copy / "eval") == before

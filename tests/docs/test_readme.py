@@ -61,6 +61,7 @@ def place(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_wait_for_the_disk", "coarse_surfaces")
 def test_every_command_runs(place, monkeypatch):
     monkeypatch.chdir(place)

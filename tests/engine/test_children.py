@@ -40,8 +40,10 @@ def started(hostile, command, **environment):
 @pytest.mark.parametrize(
     ("module", "arguments"),
     [
-        ("unmix_plugin.commands.render", ["--run", "nowhere"]),
-        ("unmix_plugin.commands.eval", ["--run", "nowhere", "--num-devices", "2"]),
+        pytest.param("unmix_plugin.commands.render", ["--run", "nowhere"], marks=pytest.mark.slow),
+        pytest.param(
+            "unmix_plugin.commands.eval", ["--run", "nowhere", "--num-devices", "2"], marks=pytest.mark.slow
+        ),
         ("unmix_plugin.captures.poses.estimation", ["nowhere.json"]),
     ],
 )

@@ -63,7 +63,7 @@ THREE = SceneSensor("three", np.eye(5)[[3, 0, 2]])
 
 @pytest.mark.parametrize(
     ("share", "exposure", "sensor"),
-    [(1.0, 0.6, None), (1.0, 1.6, THREE), (0.0, 0.6, THREE), (0.0, 1.6, None)],
+    [(1.0, 1.6, THREE), (0.0, 0.6, None)],
 )
 def test_where_gains_are_fitted_no_pose_makes_up_for_another_exposure(share, exposure, sensor):
     fitting, given = replace(SCENE, fitted=("pose", "gain")), _moved(CAMERA, share * OFF, SCENE)
@@ -90,6 +90,7 @@ def swept_rows(wobble: float) -> Cameras:
     return replace(CAMERA, key_poses=KeyPoses(torch.cat(poses), y, (32,)))
 
 
+@pytest.mark.slow
 def test_rows_that_wobble_are_aligned_and_those_that_are_right_or_show_nothing_stay():
     truth, given = swept_rows(0.02), swept_rows(0.0)
     measured = truth_of(FINE, truth)

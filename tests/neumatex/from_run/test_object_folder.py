@@ -28,6 +28,8 @@ from unmix_plugin.neumatex.from_run.object_folder import ObjectRecipe, object_of
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.trained.open_run import open_run
 
+pytestmark = pytest.mark.usefixtures("coarse_hulls")
+
 SHORT = ["--endmembers", 2, "--poses", "fixed", "--pipeline.model.initial-opacity", 0.6, *SMALL_METHOD]
 WORDS = ["--endmembers", 2, "--device", "cpu", "--poses", "fixed", "--max-num-iterations", 60]
 WORDS += ["--pipeline.datamanager.grid-resolution", 32, "--pipeline.model.samples-per-step", 8000]

@@ -66,8 +66,10 @@ TURN = [[0, 0, 1, 0.5], [1, 0, 0, -2], [0, 1, 0, 0.25]]
 APPLIED = {"applied_transform": TURN, "applied_scale": 0.5, "offset": [-2.5e6, -4.2e6, 4e6]}
 
 
-@pytest.mark.parametrize("with_alpha", [False, True])
-@pytest.mark.parametrize("wrong", [None, *WRONG])
+@pytest.mark.parametrize(
+    ("wrong", "with_alpha"),
+    [*((wrong, False) for wrong in (None, *WRONG)), ("world to camera, OpenCV axes", True)],
+)
 def test_conventions_are_told_in_scenes_turned_and_geo_referenced(demo, tmp_path, wrong, with_alpha):
     folder = rewritten(demo, tmp_path / "scene", WRONG.get(wrong, lambda pose: pose), with_alpha)
     path = folder / "transforms.json"

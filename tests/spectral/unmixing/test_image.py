@@ -23,6 +23,7 @@ def image_of(materials, size=40, seed=0, noise=0.002):
     return pixels.clamp(min=0).numpy().reshape(size, size, -1)
 
 
+@pytest.mark.usefixtures("few_searches")
 def test_materials_and_their_shares_are_found_in_whole_numbers_of_any_unit():
     materials = smooth_endmembers(3)
     cube = image_of(materials)
@@ -67,6 +68,7 @@ def test_an_image_that_spy_loaded_is_unmixed_as_the_array_of_its_numbers(tmp_pat
     np.testing.assert_array_equal(found.endmembers, expected.endmembers)
 
 
+@pytest.mark.usefixtures("few_searches")
 def test_confidence_is_high_where_a_pixel_is_pure_and_low_at_a_tie():
     materials = smooth_endmembers(2)
     share = torch.cat([torch.ones(700), torch.zeros(700), 0.5 * torch.ones(200)])[:, None].double()
@@ -154,6 +156,7 @@ def test_what_cannot_be_unmixed_is_refused_with_one_message(words, message):
         plain(**{"cube": CUBE, "endmembers": 3, **words})
 
 
+@pytest.mark.usefixtures("few_searches")
 def test_one_material_is_unmixed_and_a_number_proposed_with_its_evidence():
     cube = np.full((6, 6, 5), 0.4, np.float32) * np.linspace(0.2, 1, 5, dtype=np.float32)
     found = unmix_image(cube, 1)
@@ -189,6 +192,7 @@ def error_of(pixels, materials, true_materials, seed=0):
     return float((abundances - truth).square().mean().sqrt()), abundances, float(angles.amin(dim=1).max())
 
 
+@pytest.mark.slow
 def test_abundances_of_shaded_mixtures_are_found_whatever_the_seed():
     pixels, materials = landscape(dark=0.6)
     found = [error_of(pixels, materials, materials, seed) for seed in range(2)]
@@ -198,6 +202,7 @@ def test_abundances_of_shaded_mixtures_are_found_whatever_the_seed():
     assert float((abundances[0] - abundances[1]).square().mean().sqrt()) < 0.02
 
 
+@pytest.mark.usefixtures("few_searches")
 def test_a_nearly_black_material_is_counted_between_spectra_of_one_peak():
     pixels, materials = landscape(dark=0.05)
     assert error_of(pixels, materials, materials / materials.amax(dim=1, keepdim=True))[0] < 0.06
