@@ -27,6 +27,7 @@ from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.formats.envi import read_header
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.settings import SceneOptions
+from unmix_plugin.spectral.library.spectra_csv import read_spectra
 from unmix_plugin.trained.measured_errors import write_errors
 from unmix_plugin.trained.measures import keep_region
 from unmix_plugin.trained.open_run import load_run, open_run
@@ -407,10 +408,19 @@ def test_numbers_stand_between_the_ends_of_their_intervals(solid_copy):
     views = torch.randint(0, 5, (len(places),), generator=generator)
     compared = ComparedPixels(places, views, spectra, measured, abundances, possible[None])
     errors = PlaceErrors.fit(
-        compared, 0.01 * scene.materials.endmembers.cpu(), low, 0.25 * float((high - low).max())
+        compared,
+        scene.materials.endmembers.cpu(),
+        0.01 * scene.materials.endmembers.cpu(),
+        low,
+        0.25 * float((high - low).max()),
     )
     write_errors(solid_copy, errors, loaded.training.steps)
 
+    done(export, *words("endmembers", "--run", solid_copy))
+    ends = read_spectra(solid_copy / "exports/endmembers/endmembers-intervals.csv")
+    assert ends.names[:2] == tuple(f"{scene.materials.names[0]}{end}" for end in ("_low", "_high"))
+    assert (ends.spectra[0] < scene.materials.endmembers[0].numpy()).all()
+    assert (ends.spectra[1] > scene.materials.endmembers[0].numpy()).all()
     done(export, *words("regions", "--run", solid_copy))
     with (solid_copy / "exports/regions/regions.csv").open() as file:
         rows = list(csv.DictReader(file))

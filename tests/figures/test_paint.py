@@ -53,14 +53,19 @@ def test_where_nothing_is_the_background_shows(kind):
         assert not painted.rgba().any()
 
 
-def test_values_beyond_a_scale_have_the_colours_of_its_ends_and_undefined_ones_are_not_shown():
+def test_values_beyond_a_scale_have_the_colours_of_its_ends_and_undefined_ones_are_hatched():
     given = output("map", value_range=(0.0, 1.0))
     painted = paint(given, torch.tensor([[-1.0, 0.0, 0.5, 1.0, 7.0, torch.nan]]), torch.ones(1, 6))
     [row] = painted.over()[:, :, 0].numpy()
     table = colour_table("viridis")
     np.testing.assert_allclose(row[:5], table[[0, 0, 128, 255, 255]])
-    np.testing.assert_allclose(row[5], NEUTRAL)
-    assert painted.rgba()[0, :, 0, 3].tolist() == [255] * 5 + [0]
+    assert np.ptp(row[5]) == 0
+    assert painted.rgba()[0, :, 0, 3].tolist() == [255] * 6
+    nothing = torch.full((16, 16), torch.nan)
+    greys = paint(given, nothing, torch.ones(16, 16)).picture()
+    assert len(np.unique(greys)) == 2
+    np.testing.assert_array_equal(greys[1:, :-1], greys[:-1, 1:])  # along diagonals
+    assert not paint(given, nothing, torch.full((16, 16), 0.4)).rgba().any()
     chosen = paint(
         given, torch.tensor([[1.5]]), torch.ones(1, 1), look=Look(colour_map="gray", value_range=(1.0, 2.0))
     )

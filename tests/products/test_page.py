@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from tests.factories.ball_page import SCENE, export
+from tests.factories.ball_model import RADIUS
+from tests.factories.ball_page import REGIONS, SCENE, export
 from tests.factories.files import present
 from unmix_plugin.editing import Light, Recipe, edit_scene
 from unmix_plugin.editing.apply import with_sensor
@@ -15,6 +16,7 @@ from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.products.page import page
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 from unmix_plugin.spectral.sensor import SpectralResponses
+from unmix_plugin.trained.place_errors import ComparedPixels, PlaceErrors
 
 
 @pytest.fixture(scope="module")
@@ -30,6 +32,28 @@ def test_regions_that_can_not_be_shown_are_said(exported):
         "Not shown: the region of no material can't be found: the scene has no material 7; it has 3.",
     ):
         assert any(one.startswith(text) for one in said)
+
+
+def test_values_stand_with_their_intervals_or_the_reason_why_there_are_none(exported, tmp_path):
+    assert exported[0]["interval"]["not_determined"] == SCENE.errors
+    assert "half_widths" not in exported[0]["arrays"]
+    generator, count = torch.Generator().manual_seed(0), 4000
+    places = RADIUS * torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
+    views, endmembers = torch.randint(0, 5, (count,), generator=generator), SCENE.materials.endmembers
+    abundances, spectra = torch.full((count, 3), 1 / 3), torch.ones(count, len(SCENE.bands))
+    possible = abundances + 0.05 * torch.randn(1, count, 3, generator=generator)
+    pixels = ComparedPixels(places, views, spectra, 0.9 * spectra, abundances, possible)
+    deviations = torch.tensor([[0.1], [0.1], [0.9]]) * endmembers
+    errors = PlaceErrors.fit(pixels, endmembers, deviations, torch.full((3,), -1.0), SCENE.pixel_size)
+    assert errors is not None
+    facts, _, _ = export(tmp_path, replace(SCENE, measured_errors=errors), {"below": REGIONS["below"]})
+    [region] = facts["interval"]["regions"]
+    first, second, third = region["abundances"]
+    assert first[0] <= 1e-3
+    assert 0.9 < second[0] < second[1] <= 1
+    assert third is None
+    assert region["area"][0] < region["area"][1]
+    assert facts["arrays"]["half_widths"]["width"] == 3
 
 
 def test_a_page_of_an_edited_run_says_so_and_one_that_can_not_be_small_that(exported, tmp_path, monkeypatch):

@@ -58,3 +58,14 @@ def test_an_interval_that_is_unknown_says_why():
     unknown = Interval.unknown(np.zeros(3), 0.9, "nobody measured")
     assert np.isnan(unknown.width).all()
     assert unknown.not_determined == "nobody measured"
+    assert not unknown.is_known
+
+
+def test_an_endmember_whose_error_is_large_beside_it_has_no_interval_and_the_others_have():
+    spectra, deviations = np.full((2, 4), 0.5), np.array([[0.02] * 4, [0.2] * 4])
+    found = Interval.of_endmembers(spectra, deviations, 0.9)
+    np.testing.assert_allclose(found.width[0], 2 * 1.645 * 0.02, rtol=1e-3)
+    assert np.isnan(found.width[1]).all()
+    assert found.is_known
+    assert "none like it" in found.not_determined
+    assert found.in_words("{:.2f}") == [*["0.47 to 0.53"] * 4, *["not determined"] * 4]

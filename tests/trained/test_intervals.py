@@ -29,6 +29,8 @@ from unmix_plugin.trained.training_views import thinned_views
 PIXEL = 0.01
 WORLD_RADIUS = RADIUS / FRAME.scale
 VIEWS = 12
+DEVIATIONS = torch.tensor([[0.01], [0.1], [0.5]]).expand(3, NUM_BANDS)
+"""Of endmembers of value 1; the last is not determined."""
 
 
 def places(count, generator):
@@ -62,7 +64,8 @@ def fitted(common=0.0, count=20_000, seed=0):
     generator = torch.Generator().manual_seed(seed)
     errors = PlaceErrors.fit(
         pixel_errors(*places(count, generator), generator, common),
-        torch.full((3, NUM_BANDS), 0.01),
+        torch.ones(3, NUM_BANDS),
+        DEVIATIONS,
         torch.zeros(3),
         PIXEL,
     )
@@ -76,11 +79,11 @@ def test_of_errors_that_were_not_seen_as_many_are_within_as_the_coverage_says(co
     positions, deviations = places(5000, generator)
     fresh, local = pixel_errors(positions, deviations, generator), errors.at(positions, *known(5000))
     is_large = deviations > 0.05
-    half = width_factor(errors.abundance_factors, coverage) * local.abundances
+    half = width_factor(errors.abundance_factors, coverage) * local.abundances[:, :2]
     of_spectra = (
         width_factor(errors.spectrum_factors, coverage) * local.spectra[:, None] * errors.band_deviations
     )
-    of_abundances, of_bands = fresh.abundances - fresh.possible[0], fresh.rendered - fresh.measured
+    of_abundances, of_bands = (fresh.abundances - fresh.possible[0])[:, :2], fresh.rendered - fresh.measured
     for within in (of_abundances.abs() <= half, of_bands.abs() <= of_spectra):
         for part in (is_large, ~is_large):
             assert float(within[part].double().mean()) == pytest.approx(coverage, abs=0.03)
@@ -96,8 +99,9 @@ def test_what_is_the_same_everywhere_stays_in_the_mean_of_a_region_and_the_rest_
     own = independent.over_region(independent.at(positions, *known(500)), weights, edge)
     alone = alike.at(positions, *known(500))
     shared = alike.over_region(alone, weights, edge)
-    assert float(own.abundances.max()) < 0.2 * float(alone.abundances.mean())
-    assert float(shared.abundances.min()) > 0.6 * float(alone.abundances.square().mean().sqrt())
+    assert float(own.abundances[:2].max()) < 0.2 * float(alone.abundances[:, :2].mean())
+    assert float(shared.abundances[:2].min()) > 0.6 * float(alone.abundances[:, :2].square().mean().sqrt())
+    assert own.abundances.isnan().tolist() == [False, False, True]
 
 
 def test_where_fewer_than_two_views_measured_errors_are_unknown():
@@ -107,7 +111,7 @@ def test_where_fewer_than_two_views_measured_errors_are_unknown():
     )
     local = errors.at(away, *known(2))
     assert local.spectra.isfinite().tolist() == [True, False]
-    assert local.abundances.isfinite().all(dim=1).tolist() == [True, False]
+    assert local.abundances.isfinite().tolist() == [[True, True, False], [False] * 3]
     nowhere = errors.over_region(errors.at(away[1:], *known(1)), np.ones(1), PIXEL)
     assert nowhere.spectra.isnan().all()
 
@@ -116,7 +120,7 @@ def test_of_two_views_nothing_is_said():
     generator = torch.Generator().manual_seed(0)
     found = pixel_errors(*places(2000, generator), generator)
     few = replace(found, views=found.views % 2)
-    assert PlaceErrors.fit(few, torch.zeros(3, NUM_BANDS), torch.zeros(3), PIXEL) is None
+    assert PlaceErrors.fit(few, torch.ones(3, NUM_BANDS), DEVIATIONS, torch.zeros(3), PIXEL) is None
 
 
 def test_a_run_keeps_its_errors_and_says_why_there_are_none(tmp_path):
@@ -152,7 +156,30 @@ def measured(tmp_path_factory):
     ball = replace(ball_scene(), views=views, frame=FRAME)
     errors = measure_errors(ball, list(thinned_views(ball, MeasuredScene(scene, None))))
     assert errors is not None
-    return replace(ball, measured_errors=errors)
+    # Its endmembers are none of the scene's.
+    return replace(ball, measured_errors=replace(errors, is_determined=torch.ones_like(errors.is_determined)))
+
+
+def test_endmembers_that_the_pixels_do_not_tell_have_no_intervals_and_say_why(measured):
+    errors = measured.measured_errors
+    certain = torch.ones_like(errors.is_determined)
+    certain[0] = False
+    told = replace(measured, measured_errors=replace(errors, is_determined=certain))
+    probe = told.probe(*middle(told))
+    interval = probe.interval("abundances")
+    assert interval.is_known
+    assert np.isnan(interval.low).tolist() == (~certain).tolist()
+    assert "none like it" in interval.not_determined
+    assert "none like it" in told.interval(probe, "abundance:0").not_determined
+    assert told.interval(probe, "abundance:1").not_determined == ""
+    spectra = replace(
+        measured, measured_errors=replace(errors, endmember_deviations=0.1 * measured.materials.endmembers)
+    )
+    ends = spectra.endmember_interval(0.9)
+    np.testing.assert_allclose(ends.width, 2 * 1.645 * 0.1 * measured.materials.endmembers, rtol=1e-3)
+    assert ends.not_determined == ""
+    untold = replace(measured, measured_errors="nobody looked").endmember_interval()
+    assert untold.not_determined == "nobody looked"
 
 
 def middle(scene):

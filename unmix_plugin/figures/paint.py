@@ -24,12 +24,15 @@ from unmix_plugin.engine.outputs import Output
 from unmix_plugin.figures.look import BACKGROUNDS, NEUTRAL, Look
 from unmix_plugin.figures.plotting import Colour, id_colours
 from unmix_plugin.spectral.colour.conversion import agx, linear_to_srgb, srgb_to_linear
+from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION
 from unmix_plugin.spectral.segmentation import NOTHING_ID
 
 LIGHT_KINDS = frozenset({"srgb", "linear", "grey"})
 """Kinds of outputs that are light before black, hence multiplied by opacity already."""
 
 _LEAST_OPACITY = 1e-6
+_HATCH_PX, _HATCH_GREYS = 8, (0.55, 0.8)
+"""Edge and sRGB of the stripes of what is seen and has no number."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +95,7 @@ def paint(
 
     Args:
         output: What the numbers are; of any kind but `channels` and `spectra`, which are no picture.
-        values: (H, W, ...); what is not finite is not shown.
+        values: (H, W, ...); numbers of something that is seen are hatched where they are undefined.
         opacity: How much of each pixel they fill, [0, 1].
         value_range: At the ends of the colour map, where neither the look nor the output says it.
         look: How the user has chosen to see it.
@@ -122,7 +125,12 @@ def paint(
     if kind == "grey" or output.is_premultiplied:
         tiles = tiles / part.clamp(min=_LEAST_OPACITY)[..., None]
     is_known = tiles.isfinite().all(dim=-1)
-    return Painted(_mapped(tiles, legend), part * is_known, False, legend)
+    is_hatched = ~is_known & (part >= OCCUPIED_ACCUMULATION)
+    height, width = part.shape
+    rows, columns = torch.arange(height, device=part.device)[:, None], torch.arange(width, device=part.device)
+    stripes = torch.where((rows + columns) % _HATCH_PX < _HATCH_PX // 2, *_HATCH_GREYS).to(tiles)
+    colours = torch.where(is_hatched[..., None, None], stripes[..., None, None], _mapped(tiles, legend))
+    return Painted(colours, part * (is_known | is_hatched), False, legend)
 
 
 def legend_of(output: Output, value_range: tuple[float, float] | None, look: Look) -> Legend:

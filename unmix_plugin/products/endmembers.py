@@ -18,8 +18,9 @@ from unmix_plugin.formats.libraries import library_of
 from unmix_plugin.products.product import Job
 from unmix_plugin.products.scene_products import Endmembers
 from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.intervals import COVERAGE, Interval
 from unmix_plugin.spectral.library.material_library import Comparison, MaterialLibrary
-from unmix_plugin.spectral.library.spectra_csv import write_spectra_csv
+from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.run_materials import LIGHT_UNKNOWN, endmember_colours
 
@@ -37,18 +38,25 @@ def export(job: Job, asked: Endmembers) -> list[Path]:
             )
         job.claim([*paths, angles_path])
         job.say("without angles.csv: known spectra are compared in the run's own bands, without --sensor")
-        _write_endmembers(job.folder, materials)
+        nothing = Interval.unknown(np.zeros(materials.endmembers.shape), COVERAGE, "")
+        _write_endmembers(job.folder, materials, nothing)  # errors are known in the run's own bands
         remove(angles_path)  # of an earlier export, to spectra in other bands
-        return paths
+        return [path for path in paths if path.exists()]
     light = job.scene.light_power
     known = library_of(asked.library, materials.bands, light)
     job.claim([*paths, angles_path])
     if not materials.is_light_known:
         job.say(LIGHT_UNKNOWN)
-    _write_endmembers(job.folder, materials)
+    interval = job.scene.endmember_interval()
+    _write_endmembers(job.folder, materials, interval)
+    if interval.not_determined:
+        unknown = [
+            name for name, low in zip(materials.names, interval.low, strict=True) if np.isnan(low).all()
+        ]
+        job.say(f"intervals not determined, of {', '.join(unknown)}: {interval.not_determined}")
     table = materials.table()
     angles = angles_csv(known, table.names, table.spectra, table.bands, light, asked.compare)
-    return [*paths, write_file(angles_path, angles)]
+    return [*(path for path in paths if path.exists()), write_file(angles_path, angles)]
 
 
 def angles_csv(
@@ -73,20 +81,42 @@ def angles_csv(
 
 def _endmember_paths(folder: Path) -> list[Path]:
     base = folder / "endmembers"
-    return [folder / "endmembers.csv", *envi_library_paths(base), folder / "endmembers.png"]
+    return [
+        folder / "endmembers.csv",
+        folder / "endmembers-intervals.csv",
+        *envi_library_paths(base),
+        folder / "endmembers.png",
+    ]
 
 
-def _write_endmembers(folder: Path, materials: Materials) -> None:
-    """Write the endmembers as CSV (wavelength in nm, a column a spectrum), ENVI spectral library and plot."""
-    table_path, *_, plot_path = _endmember_paths(make_folder(folder))
+def write_intervals(path: Path, bands: Bands, names: Sequence[str], interval: Interval) -> None:
+    """Write the ends of the intervals of endmembers as CSV, columns NAME_low and NAME_high; none, and no file, where
+    they are not determined."""
+    known = [index for index, low in enumerate(interval.low) if np.isfinite(low).all()]
+    if not known:
+        remove(path)
+        return
+    titles = tuple(f"{names[index]}{end}" for index in known for end in ("_low", "_high"))
+    ends = np.stack([values[index] for index in known for values in (interval.low, interval.high)])
+    write_spectra_csv(path, SpectraTable(bands, titles, ends))
+
+
+def _write_endmembers(folder: Path, materials: Materials, interval: Interval) -> None:
+    """Write the endmembers as CSV (wavelength in nm, a column a spectrum) and the same of the ends of their intervals,
+    ENVI spectral library and plot."""
+    table_path, intervals_path, *_, plot_path = _endmember_paths(make_folder(folder))
     spectra = materials.endmembers.detach().cpu().numpy().astype(np.float32)
     about = f"endmembers: {materials.quantity}, 1 = full scale"
     write_envi_library(folder / "endmembers", spectra, materials.bands, materials.names, about)
     write_spectra_csv(table_path, materials.table())
+    write_intervals(intervals_path, materials.bands, materials.names, interval)
     under = "reflectance" if materials.quantity == "reflectance" else "radiance under the scene's light"
     labels = ("wavelength (nm)", f"{under} (1 = full scale)")
     colours = endmember_colours(materials)
-    write_file(plot_path, draw_spectra(spectra, materials.bands.centers_nm, materials.names, colours, labels))
+    write_file(
+        plot_path,
+        draw_spectra(spectra, materials.bands.centers_nm, materials.names, colours, labels, interval),
+    )
 
 
 def draw_spectra(
@@ -95,9 +125,10 @@ def draw_spectra(
     names: Sequence[str],
     colours: Float[np.ndarray, "K 3"],
     labels: tuple[str, str],
+    interval: Interval | None = None,
 ) -> bytes:
-    """Endmembers as lines over wavelengths or numbers of bands, as a PNG; from the ninth on, dashes tell near colours
-    apart too. `labels` are those of both axes."""
+    """Endmembers as lines over wavelengths or numbers of bands, as a PNG, with their intervals where they are known;
+    from the ninth on, dashes tell near colours apart too. `labels` are those of both axes."""
     from matplotlib.figure import Figure
 
     legend_columns = -(-len(colours) // _LEGEND_ROWS)
@@ -114,6 +145,9 @@ def draw_spectra(
             markersize=3.5,
             label=plot_text(names[index]),
         )
+        if interval is not None and np.isfinite(interval.low[index]).all():
+            ends = (interval.low[index], interval.high[index])
+            axes.fill_between(x, *ends, color=tuple(colour), alpha=0.15, linewidth=0)
     axes.set(xlabel=plot_text(labels[0]), ylabel=plot_text(labels[1]))
     axes.set_ylim(bottom=0.0)
     axes.set_title("Endmembers", loc="left", fontweight="bold")

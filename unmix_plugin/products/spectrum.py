@@ -199,7 +199,7 @@ def _write_spectrum(folder: Path, place: _ProbedPlace, scene: TrainedScene) -> l
     if place.spread is not None:
         columns = {"mean": columns["predicted"].clip(min=0), "standard deviation": place.spread}
     interval = place.probe.interval("predicted")
-    if not interval.not_determined:
+    if interval.is_known:
         name = "predicted" if place.spread is None else "mean"
         columns |= {f"{name}_low": interval.low, f"{name}_high": interval.high}
     values = np.stack(list(columns.values()))
@@ -226,7 +226,7 @@ def _draw_spectrum(place: _ProbedPlace, materials: Materials) -> bytes:
         mean, spread = place.over_views.mean, place.over_views.spread
         label = f"{len(place.over_views.views)} training views{place.unedited}, ± 1 std. dev."
     interval = place.probe.interval("predicted")
-    if not interval.not_determined:
+    if interval.is_known:
         lines.fill_between(
             wavelengths,
             interval.low,
@@ -258,7 +258,7 @@ def _draw_abundances(axes: Any, probe: Probe, materials: Materials) -> None:
     colours = endmember_colours(materials)
     interval = probe.interval("abundances")
     reach = None
-    if not interval.not_determined:
+    if interval.is_known:
         reach = np.stack([probe.abundances - interval.low, interval.high - probe.abundances]).clip(min=0)[
             :, chosen
         ]
@@ -284,9 +284,12 @@ def _facts(place: _ProbedPlace, materials: Materials) -> dict[str, Any]:
     shares = dict(zip(materials.names, probe.abundances.tolist(), strict=True))
     interval = probe.interval("abundances")
     ends = {
-        f"abundances_{end}": None
-        if interval.not_determined
-        else dict(zip(materials.names, values, strict=True))
+        f"abundances_{end}": {
+            name: value if math.isfinite(value) else None
+            for name, value in zip(materials.names, values, strict=True)
+        }
+        if interval.is_known
+        else None
         for end, values in (("low", interval.low.tolist()), ("high", interval.high.tolist()))
     }
     position = probe.world_position

@@ -13,12 +13,13 @@ import torch
 from jaxtyping import Float64, Int
 
 from unmix_plugin.engine.outputs import Output
+from unmix_plugin.engine.runs.replacing import remove
 from unmix_plugin.figures.paint import paint, scale_of
 from unmix_plugin.figures.pictures import Picture, TitledPicture, draw_panels, in_rows
 from unmix_plugin.figures.plotting import distinct_colours, own_colours
 from unmix_plugin.formats.envi import envi_cube_paths, write_envi_cube
 from unmix_plugin.formats.files import csv_bytes, make_folder, write_file
-from unmix_plugin.products.endmembers import angles_csv, draw_spectra
+from unmix_plugin.products.endmembers import angles_csv, draw_spectra, write_intervals
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.features import NoiseFractions
 from unmix_plugin.spectral.library.material_library import MaterialLibrary
@@ -37,7 +38,8 @@ def unmixed_image_paths(folder: Path, has_library: bool, has_fractions: bool) ->
     ]
     cubes += [folder / "angles.csv"] if has_library else []
     cubes += [*envi_cube_paths(folder / "mnf"), folder / "mnf.csv"] if has_fractions else []
-    return [*(folder / name for name in ("endmembers.csv", "endmembers.png", "maps.png")), *cubes]
+    tables = ("endmembers.csv", "endmembers-intervals.csv", "endmembers.png", "maps.png")
+    return [*(folder / name for name in tables), *cubes]
 
 
 def write_unmixed_image(
@@ -62,18 +64,21 @@ def write_unmixed_image(
     names = [f"material {number}" for number in range(1, len(found.endmembers) + 1)]
     spectra = found.endmembers.astype(np.float64)
     bands = None if wavelengths_nm is None else Bands.of(wavelengths_nm)
+    of_endmembers = found.endmember_interval()
     if bands is None:
         x, x_label, own = numbers, "band", np.resize(_FIRST_COLOURS, (len(names), 3))
         rows = [
             [number, *(f"{value:.9g}" for value in row)] for number, row in zip(x, spectra.T, strict=True)
         ]
         write_file(folder / "endmembers.csv", csv_bytes([["band", *names], *rows]))
+        remove(folder / "endmembers-intervals.csv")  # its columns are spectra over wavelengths
     else:
         x, x_label = bands.centers_nm, "wavelength (nm)"
         own = own_colours(torch.from_numpy(spectra / max(float(spectra.max()), 1e-12)), bands)
         write_spectra_csv(folder / "endmembers.csv", SpectraTable(bands, tuple(names), spectra))
+        write_intervals(folder / "endmembers-intervals.csv", bands, names, of_endmembers)
     colours, labels = distinct_colours(own), (x_label, "value in the image's unit")
-    write_file(folder / "endmembers.png", draw_spectra(spectra, x, names, colours, labels))
+    write_file(folder / "endmembers.png", draw_spectra(spectra, x, names, colours, labels, of_endmembers))
     write_file(folder / "maps.png", _maps(found, names, colours))
     about = f"abundances: shares of {found.shares}, 0 to 1"
     write_envi_cube(folder / "abundances", found.abundances, None, names, about, on_map)

@@ -16,10 +16,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from statistics import NormalDist
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from unmix_plugin.errors import ConfigError
@@ -28,6 +29,10 @@ COVERAGE = 0.9
 """Of intervals where nothing else is asked for."""
 COVERAGES = (0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
 """For which errors are counted; between them widths are interpolated."""
+_MOST_ERROR = 0.3
+"""Expected error of an endmember in lengths of it: beyond that, the sets of endmembers that explain the pixels alike
+have another material in its place."""
+UNDETERMINED = "other sets of endmembers that explain the pixels as well have none like it"
 _MOST_ERRORS = 1_000_000
 """That quantiles are taken of."""
 
@@ -42,18 +47,51 @@ class Interval:
     coverage: float
     """Probability that it is meant to hold what is true."""
     not_determined: str = ""
-    """Why there is no interval, for people; empty where there is one."""
+    """Why there is no interval, or none of some of the values, for people; empty where all have one."""
+
+    @property
+    def is_known(self) -> bool:
+        """Whether any of the values has an interval."""
+        return bool(np.isfinite(self.low).any())
 
     @property
     def width(self) -> Float64[np.ndarray, "*values"]:
         """From low to high."""
         return np.asarray(self.high - self.low)
 
+    def in_words(self, number: str) -> list[str]:
+        """From low to high of each value, by a format of numbers."""
+        return [
+            f"{number.format(low)} to {number.format(high)}" if np.isfinite(low) else "not determined"
+            for low, high in zip(self.low.ravel(), self.high.ravel(), strict=True)
+        ]
+
     @staticmethod
     def unknown(values: Float64[np.ndarray, "*values"], coverage: float, reason: str) -> Interval:
         """Of values about which nothing can be said."""
         nothing = np.full(values.shape, np.nan)
         return Interval(nothing, nothing, coverage, reason)
+
+    @staticmethod
+    def of_endmembers(
+        spectra: Float64[np.ndarray, "K B"], deviations: Float64[np.ndarray, "K B"], coverage: float
+    ) -> Interval:
+        """Of endmembers by their expected errors, as if these were normally distributed: no view that is left out tells
+        more. Not determined where an endmember's error is large beside it."""
+        require_coverage(coverage)
+        half = NormalDist().inv_cdf((1 + coverage) / 2) * deviations
+        is_known = is_determined(spectra, deviations)
+        low, high = (
+            np.where(is_known[:, None], end, np.nan) for end in ((spectra - half).clip(min=0), spectra + half)
+        )
+        return Interval(low, high, coverage, "" if is_known.all() else UNDETERMINED)
+
+
+def is_determined(
+    spectra: Float64[np.ndarray, "K B"], deviations: Float64[np.ndarray, "K B"]
+) -> Bool[np.ndarray, " K"]:
+    """Whether the expected error of each endmember is small beside it."""
+    return np.linalg.norm(deviations, axis=1) <= _MOST_ERROR * np.linalg.norm(spectra, axis=1)
 
 
 def require_coverage(coverage: float) -> None:

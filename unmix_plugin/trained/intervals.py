@@ -13,7 +13,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.spectral.intervals import COVERAGE, Interval, propagated_deviation, width_factor
+from unmix_plugin.spectral.intervals import (
+    COVERAGE,
+    UNDETERMINED,
+    Interval,
+    propagated_deviation,
+    width_factor,
+)
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Materials
 from unmix_plugin.trained.place_errors import LocalErrors
 
@@ -83,13 +89,15 @@ def reflectance_number(materials: Materials, score: Callable[[Tensor], Tensor] |
     return number
 
 
-def as_interval(ends: tuple[Tensor, Tensor], errors: LocalErrors, coverage: float) -> Interval:
-    """Ends at one place as an interval, which says why where it is not determined."""
+def as_interval(name: str, ends: tuple[Tensor, Tensor], errors: LocalErrors, coverage: float) -> Interval:
+    """Ends of an output at one place as an interval, which says why where it is not determined."""
     low, high = (one.detach().double().cpu().numpy() for one in ends)
     reason = ""
     if not bool(errors.spectra.isfinite().all()):
         reason = TOO_FEW_VIEWS
-    elif not bool(torch.isfinite(ends[0]).any()):
+    elif name.startswith("abundance") and not bool(ends[0].isfinite().all()):
+        reason = UNDETERMINED
+    elif not bool(ends[0].isfinite().any()):
         reason = UNDEFINED
     return Interval(low, high, coverage, reason)
 

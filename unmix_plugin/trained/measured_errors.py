@@ -74,7 +74,9 @@ def measure_errors(
         possible = (possible[:, None] + moved).clamp(0, 1).flatten(0, 1)
         deviations = (deviations.square() + (sets - endmembers).square().mean(dim=0)).sqrt()
     pixels = ComparedPixels(places, of_view, rendered / opacity, measured, abundances / opacity, possible)
-    return PlaceErrors.fit(pixels, deviations, trained.scene_box.aabb[0].cpu(), trained.pixel_size)
+    return PlaceErrors.fit(
+        pixels, endmembers, deviations, trained.scene_box.aabb[0].cpu(), trained.pixel_size
+    )
 
 
 def _fractions(amounts: Float[Tensor, "N K"]) -> Float[Tensor, "N K"]:

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.spectral.intervals import COVERAGE, Interval, width_factor
+from unmix_plugin.spectral.intervals import COVERAGE, UNDETERMINED, Interval, width_factor
 from unmix_plugin.trained.intervals import TOO_FEW_VIEWS
 from unmix_plugin.trained.measures import Scale, describe_area
 from unmix_plugin.trained.place_errors import LocalErrors, PlaceErrors
@@ -147,6 +147,8 @@ class MeasuredSurface:
         whole = np.bincount(self.mesh.faces.ravel(), np.repeat(self.areas / 3, 3), len(weights))
         least = most = weights / np.maximum(whole, 1e-30)
         if isinstance(region, OfMaterial):
+            if not bool(errors.is_determined[region.material]):
+                return found, Interval.unknown(area, COVERAGE, UNDETERMINED)
             margins = self._margins(region.material, errors, edge)
             least, most = (margins > 1).astype(np.float64), (margins > -1).astype(np.float64)
         # Outlines are known to about half a pixel, which is how far neighbouring vertices are apart.

@@ -208,7 +208,7 @@ def _interval(name: str, argument: str, materials: Materials) -> MaterialOutput:
         FAMILIES["interval"].title,
         f"{about}, {what}",
         (0.0, 0.5) if is_abundance else None,
-        remarks=("NaN where not determined",),
+        remarks=("NaN where not determined, which is hatched",),
         compute=width,
     )
 

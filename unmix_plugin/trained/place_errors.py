@@ -26,7 +26,7 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
-from unmix_plugin.spectral.intervals import propagated_deviation, width_factors
+from unmix_plugin.spectral.intervals import is_determined, propagated_deviation, width_factors
 
 CELL_SIZES_PX = (12.0, 3.0)
 """Edges of cells, in pixels as large as they are in the middle of the scene."""
@@ -163,6 +163,8 @@ class PlaceErrors:
     """Usual root mean squared error of each band, radiance."""
     endmember_deviations: Float[Tensor, "K B"]
     """Expected errors of the endmembers, radiance."""
+    is_determined: Bool[Tensor, "K"]
+    """Whether these are small beside the endmembers."""
     abundance_levels: Float[Tensor, "A"]
     """Errors of abundances of each group in multiples of what cells say."""
     brightness_edges: Float[Tensor, "edges"]
@@ -181,11 +183,13 @@ class PlaceErrors:
     @staticmethod
     def fit(
         pixels: ComparedPixels,
+        endmembers: Float[Tensor, "K B"],
         endmember_deviations: Float[Tensor, "K B"],
         origin: Float[Tensor, "3"],
         pixel_size: float,
     ) -> PlaceErrors | None:
-        """What compared pixels tell; None where fewer than three views measured any."""
+        """What compared pixels tell, with expected errors of the endmembers; None where fewer than three views measured
+        any."""
         if len(pixels.views.unique()) <= _FEWEST_VIEWS:
             return None
         generator = torch.Generator().manual_seed(0)
@@ -248,6 +252,9 @@ class PlaceErrors:
             directions=directions,
             band_deviations=band_squares.sqrt(),
             endmember_deviations=endmember_deviations.double(),
+            is_determined=torch.from_numpy(
+                is_determined(endmembers.double().numpy(), endmember_deviations.double().numpy())
+            ),
             abundance_levels=abundance_levels,
             brightness_edges=brightness_edges,
             brightness_levels=brightness_levels,
@@ -269,7 +276,7 @@ class PlaceErrors:
         spectra: Float[Tensor, "*places B"],
     ) -> LocalErrors:
         """At places of model space with these abundances and this radiance; unknown (NaN) where fewer than two views
-        measured around."""
+        measured around, and of abundances of endmembers that are not determined."""
         flat = positions.reshape(-1, 3).to(self.origin)
         squares = self.usual.expand(len(flat), -1)
         is_known = torch.zeros(len(flat), dtype=torch.bool, device=flat.device)
@@ -284,6 +291,7 @@ class PlaceErrors:
         deviations = deviations.reshape(*positions.shape[:-1], -1)
         edges = self.origin.new_tensor(_ABUNDANCE_EDGES)
         levels = self.abundance_levels[torch.bucketize(abundances.to(edges), edges)]
+        levels = levels.where(self.is_determined, torch.nan)
         lengths = spectra.to(self.origin).norm(dim=-1)
         of_spectra = (
             deviations[..., -3:] * self.brightness_levels[torch.bucketize(lengths, self.brightness_edges)]
@@ -294,13 +302,13 @@ class PlaceErrors:
         """Of means over a region of the surface, from errors at places in it, what these weigh, and the edge of a
         square of its area (model units)."""
         parts = torch.from_numpy(weights / weights.sum()).to(self.origin)
-        parts = torch.where(local.spectra.isfinite(), parts, 0.0)
+        parts = torch.where(local.spectra.isfinite(), parts, 0.0)[:, None]
         total = parts.sum()
         whole = torch.where(total >= 0.5, 1 / total.clamp(min=1e-12), torch.nan)
         of_abundances, of_spectra = self.alike(edge)
         spectral = torch.stack([local.spectra, local.shape, local.brightness], dim=1)
         means = [
-            (alike * whole * (parts[:, None] * values.nan_to_num().square()).sum(dim=0)).sqrt()
+            (alike * whole * torch.where(parts > 0, parts * values.square(), 0.0).sum(dim=0)).sqrt()
             for alike, values in ((of_abundances, local.abundances), (of_spectra, spectral))
         ]
         return LocalErrors(means[0], *means[1].unbind(), scene=self)

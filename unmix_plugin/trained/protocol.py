@@ -69,7 +69,7 @@ class Probe:
             return Interval.unknown(values, coverage, reason)
         seen = seen_place(self, errors)
         ends = seen.of_abundances(coverage) if name == "abundances" else seen.of_spectra(coverage)
-        found = as_interval(ends, errors, coverage)
+        found = as_interval(name, ends, errors, coverage)
         if name == "abundances":
             return found
         return replace(found, low=found.low * self.opacity, high=found.high * self.opacity)

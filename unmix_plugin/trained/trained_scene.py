@@ -337,7 +337,16 @@ class TrainedScene:
         if isinstance(probe.errors, str) or probe.opacity < OCCUPIED_ACCUMULATION:
             reason = probe.errors if isinstance(probe.errors, str) else "hardly anything is there"
             return Interval.unknown(np.zeros(()), coverage, reason)
-        return as_interval(ends(seen_place(probe, probe.errors), coverage), probe.errors, coverage)
+        return as_interval(name, ends(seen_place(probe, probe.errors), coverage), probe.errors, coverage)
+
+    def endmember_interval(self, coverage: float = COVERAGE) -> Interval:
+        """Where each endmember lies in each band, (K, B), radiance under the scene's light and as bright as it is; of
+        those that are not determined it says why. A ConfigError where there is none of that coverage."""
+        require_coverage(coverage)
+        errors, spectra = self.errors, self.materials.endmembers.detach().double().cpu().numpy()
+        if isinstance(errors, str):
+            return Interval.unknown(spectra, coverage, errors)
+        return Interval.of_endmembers(spectra, errors.endmember_deviations.double().cpu().numpy(), coverage)
 
     @torch.no_grad()
     def probe_point(self, x: float, y: float, z: float) -> Probe:

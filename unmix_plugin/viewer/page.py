@@ -143,11 +143,13 @@ def bars(entries: Iterable[tuple[str, float, Sequence[float]]], interval: Interv
     one, or why it is not determined."""
     shown = list(entries)
     ends, note = [""] * len(shown), ""
-    if interval is not None and interval.not_determined:
-        note = f'<div style="opacity:0.7">interval not determined: {escape(interval.not_determined)}</div>'
-    elif interval is not None:
-        ends = [f"{low:.2f} to {high:.2f}" for low, high in zip(interval.low, interval.high, strict=True)]
-        note = f'<div style="opacity:0.7">and {interval.coverage:.0%} interval</div>'
+    if interval is not None:
+        notes = [f"and {interval.coverage:.0%} interval"] if interval.is_known else []
+        if interval.is_known:
+            ends = interval.in_words("{:.2f}")
+        if interval.not_determined:
+            notes.append(f"interval not determined: {escape(interval.not_determined)}")
+        note = "".join(f'<div style="opacity:0.7">{one}</div>' for one in notes)
     ordered = sorted(zip(shown, ends, strict=True), key=lambda pair: -pair[0][1])[:16]
     rows = (
         f'{_ROW}<span style="flex:0 0 8.5em;overflow-wrap:anywhere">{escape(name)}</span>'

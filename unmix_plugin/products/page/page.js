@@ -47,7 +47,7 @@
   };
   const [positions, materials, confidence, unexplained] = ["positions", "materials", "confidence", "unexplained"].map(read);
   const [areas, keptShares] = ["areas", "regions"].map(read);
-  const [scaled, abundances, gloss, tints] = ["scaled", "abundances", "gloss", "tints"].map(read);
+  const [scaled, abundances, gloss, tints, halfWidths] = ["scaled", "abundances", "gloss", "tints", "half_widths"].map(read);
   // Of objects whose light can be exchanged: `relit` says how the rest is meant.
   const relit = facts.relit;
   const [base, polish, normals, transfer, mirrored, tones] = ["base", "polish", "normals", "transfer", "mirrored", "tones"].map(read);
@@ -481,9 +481,15 @@
     const { hit, corners, weights } = found;
     const mean = (values, width, i) => meanOf(found, values, width, i);
     const from = camera.position.clone().sub(hit.point).normalize().toArray();
+    const mixture = names.map((_, k) => mean(abundances, K, k));
+    // A half width of 0 is one that is not determined.
+    const ends = mixture.map((share, k) => {
+      if (!halfWidths || corners.some((v) => !halfWidths[v * K + k])) return null;
+      const half = mean(halfWidths, K, k);
+      return [Math.max(share - half, 0), Math.min(share + half, 1)];
+    });
     return {
-      place: hit.point.clone(), corners, weights, spectrum: spectrumOf(corners, weights, from),
-      mixture: names.map((_, k) => mean(abundances, K, k)),
+      place: hit.point.clone(), corners, weights, spectrum: spectrumOf(corners, weights, from), mixture, ends,
       finish: relit && [...[0, 1, 2].map((c) => mean(base, 3, c)), mean(polish, 3, 0), mean(polish, 3, 1)],
     };
   };
@@ -636,10 +642,14 @@
   const showProbes = () => { listProbes(); showMarks(); };
   const describe = (probe) => {
     const largest = probe.mixture.map((share, k) => [share, k]).filter(([share]) => share >= 0.02).sort((a, b) => b[0] - a[0]);
-    const shares = largest.slice(0, 4).map(([share, k]) => `${names[k]} ${Math.round(100 * share)} %`).join(", ");
+    const reach = (k) => (probe.ends?.[k] ? ` (${probe.ends[k].map((end) => Math.round(100 * end)).join(" to ")})` : "");
+    const shares = largest.slice(0, 4).map(([share, k]) => `${names[k]} ${Math.round(100 * share)} %${reach(k)}`).join(", ");
+    const isUnknown = facts.interval && probe.ends && largest.slice(0, 4).some(([, k]) => !probe.ends[k]);
+    const [low, high] = probe.areaEnds ?? [];
     const [red, green, blue, roughness, metallicity] = probe.finish || [];
     return [
-      probe.shares && areaText(probe.area), B && (shares || "nothing"),
+      probe.shares && areaText(probe.area) + (probe.areaEnds ? ` (${areaText(low)} to ${areaText(high)})` : ""), B && (shares || "nothing"),
+      isUnknown && `interval not determined: ${facts.interval.not_determined || "too few views, or an endmember that is not"}`,
       probe.finish && `base colour ${hex([red, green, blue].map(toDisplay))}, roughness ${roughness.toFixed(2)}, metallicity ${metallicity.toFixed(2)}`,
       probe.place && `at ${world(probe.place).map(shownNumber).join(", ")}`,
     ].filter(Boolean).join("; ");
@@ -786,7 +796,11 @@
     ["x", "y", "z"].forEach((axis, i) => add(axis, (probe) => probe.place && world(probe.place)[i]));
     add("area in square units", (probe) => probe.area);
     if (metresPerUnit !== null) add("area in cm2", (probe) => probe.area && probe.area * 1e4 * metresPerUnit ** 2);
-    names.forEach((name, k) => add(`abundance of ${name}`, (probe) => probe.mixture[k]));
+    ["low", "high"].forEach((end, i) => add(`area in square units_${end}`, (probe) => probe.areaEnds?.[i]));
+    names.forEach((name, k) => {
+      add(`abundance of ${name}`, (probe) => probe.mixture[k]);
+      ["low", "high"].forEach((end, i) => add(`abundance of ${name}_${end}`, (probe) => probe.ends?.[k]?.[i]));
+    });
     ["base colour red", "base colour green", "base colour blue", "roughness", "metallicity"].forEach((what, i) =>
       add(what, (probe) => probe.finish?.[i]));
     const bands = windowBands();
@@ -1055,7 +1069,8 @@
   [$("low").value, $("high").value] = [Math.floor(facts.wavelengths_nm[0]), Math.ceil(facts.wavelengths_nm.at(-1))];
   facts.regions.forEach((name, r) => {
     const found = measureRegion(keptShares.subarray(r * V, (r + 1) * V));
-    if (found) addProbe("region", found, { name, isKept: true, isShown: r < COLOURS.length });
+    const { abundances: ends, area: areaEnds } = facts.interval?.regions[r] ?? {};
+    if (found) addProbe("region", found, { name, isKept: true, isShown: r < COLOURS.length, ends, areaEnds });
   });
   openNotes();
   choose("colour");

@@ -42,6 +42,7 @@ from unmix_plugin.products.scene_products import Page
 from unmix_plugin.products.views import draw_abundances, draw_segmentation
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.colour.conversion import describe_colour, rgb_matrix
+from unmix_plugin.spectral.intervals import COVERAGE, Interval, width_factor
 from unmix_plugin.spectral.maps.indices import NAMED_INDICES, named_formula
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.measured_surface import MeasuredSurface
@@ -71,6 +72,8 @@ _LEAST_FACING = 0.15
 _RIDGE = 0.05
 """Weight of small harmonics beside the cameras' mean square error: few cameras don't make wild highlights."""
 _CHUNK = 1 << 17
+_LEAST_HALF_WIDTH = 1e-3
+"""Of an interval that is determined: with 8 bits, smaller ones would be 0."""
 
 
 @dataclass(frozen=True)
@@ -228,10 +231,15 @@ def _mixture_content(job: Job, resolution: int) -> tuple[PageContent, int]:
     arrays["areas"] = vertex_areas(mesh.areas() / job.frame.scale**2, mesh.faces, len(mesh.vertices))
     kept = job.loaded.measures.regions
     names: list[str] = []
+    of_regions: list[dict[str, Any]] = []
     if kept:
         found, failed = measure_regions(MeasuredSurface(job.scene, mesh), kept)
         notes += [f"Not shown: {reason}." for reason in failed.values()]
         inside = [region.vertex_areas for region in found.values()]
+        of_regions = [
+            {"abundances": _ends(region.probe.interval()), "area": _ends(region.area_interval)[0]}
+            for region in found.values()
+        ]
         names, of_vertex = list(found), np.maximum(arrays["areas"], 1e-30)
         if names:  # how much of each vertex is in each, 255 for all of it
             arrays["regions"] = np.round(255 * np.stack(inside) / of_vertex).astype(np.uint8)
@@ -244,7 +252,16 @@ def _mixture_content(job: Job, resolution: int) -> tuple[PageContent, int]:
         f"{view.name}: materials": draw_segmentation(view.name, seen, job.materials),
         f"{view.name}: abundances": draw_abundances(view.name, seen, job.materials),
     }
-    return PageContent(arrays, {"regions": names, "notes": notes}, pictures, job.materials), resolution
+    errors = job.scene.errors
+    intervals = {"not_determined": errors if isinstance(errors, str) else "", "regions": of_regions}
+    facts = {"regions": names, "notes": notes, "interval": intervals}
+    return PageContent(arrays, facts, pictures, job.materials), resolution
+
+
+def _ends(interval: Interval) -> list[list[float] | None]:
+    """Low and high of each value, None where not determined."""
+    pairs = np.stack([interval.low, interval.high], axis=-1).reshape(-1, 2)
+    return [pair if np.isfinite(pair).all() else None for pair in rounded(pairs)]
 
 
 def _spectral_facts(materials: Materials | None, recorded: Sequence[float] | None) -> dict[str, Any]:
@@ -334,6 +351,12 @@ def _vertex_arrays(
         "materials": scene.materials.to("cpu").ids(found).numpy(),
         "confidence": scene.materials.to("cpu").confidence(found).numpy(),
     }
+    errors = scene.errors
+    if not isinstance(errors, str):
+        spectra = found.scaled_abundances @ scene.materials.endmembers.cpu()
+        local = errors.at(positions, found.abundances, spectra).abundances.cpu()
+        half = width_factor(errors.abundance_factors, COVERAGE) * local
+        arrays["half_widths"] = half.clamp(_LEAST_HALF_WIDTH, 1).nan_to_num(0.0).numpy()  # 0: not determined
     if scene.unexplained is not None:
         arrays["unexplained"] = scene.unexplained.at(positions).nan_to_num(0.0).numpy()
     if len(scene.materials.specular_spectra):

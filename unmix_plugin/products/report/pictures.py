@@ -312,8 +312,8 @@ def region_card(
     ]
     interval, of_area = found.probe.interval("abundances"), found.area_interval
     reaches = [""] * len(materials.names)
-    if not interval.not_determined:
-        reaches = [f"{low:.3f} to {high:.3f}" for low, high in zip(interval.low, interval.high, strict=True)]
+    if interval.is_known:
+        reaches = interval.in_words("{:.3f}")
     colours = endmember_colours(materials)
     entries = zip(materials.names, colours, found.abundances.tolist(), reaches, strict=True)
     shares = sorted(entries, key=lambda entry: -entry[2])
@@ -326,5 +326,6 @@ def region_card(
         "area": area,
         "chart": chart,
         "shares": shares,
+        "is_known": interval.is_known,
         "not_determined": interval.not_determined,
     }

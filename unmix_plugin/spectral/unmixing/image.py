@@ -14,7 +14,13 @@ from jaxtyping import Bool, Float, Float32, Shaped
 from torch import Tensor
 
 from unmix_plugin.errors import SpectrumError, counted
-from unmix_plugin.spectral.intervals import COVERAGE, Interval, propagated_deviation, width_factor
+from unmix_plugin.spectral.intervals import (
+    COVERAGE,
+    Interval,
+    propagated_deviation,
+    require_coverage,
+    width_factor,
+)
 from unmix_plugin.spectral.metrics import spectral_angle
 from unmix_plugin.spectral.unmixing.abundances import nnls
 from unmix_plugin.spectral.unmixing.endmembers import (
@@ -44,6 +50,8 @@ _WIDTH_FACTORS = (0.25, 0.45, 0.72, 1.1, 2.0, 3.2, 9.4)
 """Half widths of intervals in expected errors, for each of COVERAGES: of ten artificial landscapes of even number, so
 many abundances had smaller errors."""
 
+_ALONE = "of one material there is nothing to be mixed with, and whether another is missing is unknown"
+
 Shares = Literal["auto", "area", "light"]
 """What abundances are shares of.
 
@@ -66,6 +74,8 @@ class UnmixedImage:
     how far the best searches agree, 0.95 at most; 0 where there are no abundances."""
     deviation: Float32[np.ndarray, "H W K"]
     """Expected error of each abundance, by which intervals are made; 0 where there are no abundances."""
+    endmember_deviation: Float32[np.ndarray, "K B"]
+    """Expected error of each endmember in each band, by which its interval is made."""
     misfit: Float32[np.ndarray, "H W"]
     """Angle in radians between a pixel and its mixture; 0 where there are no abundances."""
     shares: Literal["area", "light"]
@@ -73,16 +83,22 @@ class UnmixedImage:
     evidence: str
     """Why so many materials, in a few lines; empty where the number was given."""
 
+    def endmember_interval(self, coverage: float = COVERAGE) -> Interval:
+        """Where each endmember lies in each band, (K, B), as bright as it is: how far the best sets of endmembers
+        differ. Errors are those of `interval`."""
+        values = self.endmembers.astype(np.float64)
+        if len(values) == 1:
+            require_coverage(coverage)
+            return Interval.unknown(values, coverage, _ALONE)
+        return Interval.of_endmembers(values, self.endmember_deviation.astype(np.float64), coverage)
+
     def interval(self, coverage: float = COVERAGE) -> Interval:
         """Where each abundance lies, (H, W, K), with this probability; NaN where there are no abundances, and not
         determined of a single material. A ConfigError where intervals of that coverage can't be given."""
         half = width_factor(torch.tensor(_WIDTH_FACTORS), coverage) * self.deviation.astype(np.float64)
         values = self.abundances.astype(np.float64)
         if values.shape[2] == 1:
-            reason = (
-                "of one material there is nothing to be mixed with, and whether another is missing is unknown"
-            )
-            return Interval.unknown(values, coverage, reason)
+            return Interval.unknown(values, coverage, _ALONE)
         has_abundances = values.sum(axis=2, keepdims=True) > 0
         low, high = (
             np.where(has_abundances, end.clip(0, 1), np.nan) for end in (values - half, values + half)
@@ -147,6 +163,8 @@ def unmix_image(
     of_margins, of_sets = _spread_over_sets(pixels, own, found, compared, order)
     certain = _confidence(own, of_margins)
     deviation = _deviation(pixels, own, compared[order], pixels - amounts @ compared, of_sets)
+    others = found.others * lit.norm(dim=1, keepdim=True)
+    of_endmembers = (others - lit).square().mean(dim=0).sqrt()
     is_lit = amounts.sum(dim=1) > 0
     misfit = torch.where(is_lit, spectral_angle(pixels, amounts @ compared), 0.0)
     return UnmixedImage(
@@ -154,6 +172,7 @@ def unmix_image(
         _placed(own, used),
         _placed(torch.where(is_lit, certain, 0.0), used),
         _placed(torch.where(is_lit[:, None], deviation, 0.0), used),
+        (of_endmembers[order] * (brightest / _LIT)).numpy(),
         _placed(misfit, used),
         "area" if torch.equal(compared, lit) else "light",
         evidence,
