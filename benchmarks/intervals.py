@@ -1,12 +1,18 @@
 """How often do intervals hold what is true, and how wide are they?
 
     python benchmarks/intervals.py [--only table room] [--max-seconds 90]
+    python benchmarks/intervals.py --runs RUN ... --landscapes 10 --image samson_dataset.mat
 
 Trains on scenes with true abundances by the command that a user would give, and asks in all evaluation views how many
 true values lie in intervals of 50, 80, 90 and 95 %: of abundances, of reflectance (radiance where the light is unknown)
-and of an index, which both views measured. Abundances are counted twice: all, and those that are there (predicted or
-true above 0.05), since nearly every interval holds the 0 of a material that is absent. Nothing is fitted to the
-evaluation views. A minute and a half a scene; `--runs FOLDER` measures runs that are there.
+and of an index, which both views measured; of endmembers, as bright as the run has them; and of the area of each
+material on the run's own surface, whose true materials the evaluation views tell. Abundances are counted twice: all,
+and those that are there (predicted or true above 0.05), since nearly every interval holds the 0 of a material that is
+absent. Nothing is fitted to the evaluation views. A minute and a half a scene; `--runs FOLDER` measures runs that are
+there, with errors as this revision measures them at the end of a training.
+
+Images are unmixed by `unmix_image` with the true number of materials: landscapes of odd number, by which nothing was
+chosen, and a .mat file as in unmixing_2d.py.
 """
 
 from __future__ import annotations
@@ -14,6 +20,7 @@ from __future__ import annotations
 import json
 import tempfile
 import time
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -25,16 +32,25 @@ import _machine
 import numpy as np
 import torch
 import tyro
+from _landscapes import landscape
+from _unmixing_mat import read_mat
 from scipy.ndimage import distance_transform_edt
 from scipy.stats import spearmanr
 
+from unmix_plugin.errors import ConfigError
 from unmix_plugin.scenes.scene import Scene
+from unmix_plugin.spectral.intervals import Interval
 from unmix_plugin.spectral.metrics import match_endmembers
+from unmix_plugin.spectral.unmixing.image import unmix_image
 from unmix_plugin.trained.evaluation import scene_truth, view_truth
 from unmix_plugin.trained.measured_errors import measure_errors
+from unmix_plugin.trained.measured_surface import MeasuredSurface
 from unmix_plugin.trained.open_run import find_scene, load_run
 from unmix_plugin.trained.outputs import interval_ends
 from unmix_plugin.trained.places import MeasuredScene
+from unmix_plugin.trained.regions import OfMaterial
+from unmix_plugin.trained.surface import SeenSurface, in_image
+from unmix_plugin.trained.surface_mesh import vertex_areas
 from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.trained.training_views import thinned_views
 
@@ -51,6 +67,7 @@ _EDGE_PX = (1.5, 4.0)
 """Distances from edges of materials that are told apart."""
 _OPAQUE, _SEEN = 0.99, 0.5
 _ROUNDING = 1e-6
+QUANTITIES = ("abundances", "abundances there", "reflectance", "index", "endmembers")
 _MOST_RANKED = 200_000
 
 
@@ -66,6 +83,10 @@ class Options:
     """Seconds of training a scene."""
     runs: tuple[Path, ...] = ()
     """Measure these run folders, and train nothing."""
+    landscapes: int = 10
+    """Of odd number, the first so many; 0: none."""
+    image: Path | None = None
+    """A .mat file with true abundances, such as that of Samson."""
     keep: Path | None = None
     """Keep the run folders here."""
     device: Literal["cpu", "cuda"] = "cpu"
@@ -91,18 +112,28 @@ def main(options: Options) -> None:
         for run in runs:
             name, found = measure(run, options.device)
             measured[name] = found
-            print(
-                f"{name}: {found['abundances']['90']:.3f} of the abundances are in their 90 % intervals",
-                flush=True,
-            )
+            covered = found["abundances"]["90"]
+            print(f"{name}: {covered:.3f} of the abundances are in their 90 % intervals", flush=True)
+    images = {f"landscape-{number}": landscape(number) for number in range(1, 2 * options.landscapes, 2)}
+    images = dict(list(images.items())[: 1 if options.quick else None])
+    for name, one in images.items():
+        measured[name] = scores(of_image(one.pixels, one.abundances, one.endmembers), one.names)
+        print(f"{name}: done", flush=True)
+    if options.image is not None:
+        pixels, abundances, endmembers = (one.numpy() for one in read_mat(options.image))
+        names = [str(number) for number in range(len(endmembers))]
+        measured[options.image.stem] = scores(of_image(pixels, abundances, endmembers), names)
     setting = {
         "seconds of training": {
-            name: round(found["training"]["seconds"]) for name, found in measured.items()
+            name: round(found["training"]["seconds"])
+            for name, found in measured.items()
+            if "training" in found
         },
         "device": options.device,
         "options": "those of the runs given"
         if options.runs
         else "defaults, but --pipeline.model.num-endmembers = number of materials",
+        "images": "true number of materials",
         "index": "normalised difference of the bands at a quarter and three quarters",
     }
     report = _common.Report(
@@ -112,7 +143,7 @@ def main(options: Options) -> None:
         _machine.describe_machine(options.device),
         judged(measured),
         measured,
-        (by_coverage(measured), by_material(measured), by_edge(measured)),
+        (by_coverage(measured), by_material(measured), by_edge(measured), by_area(measured)),
     )
     _common.publish(report, _common.results_folder(options.results, options.quick))
 
@@ -138,7 +169,12 @@ def measure(run: Path, device: str) -> tuple[str, dict[str, Any]]:
     _ = trained.require_errors()  # which says why there are none
     counted = [of_view(trained, scene, index) for index in scene.eval_indices]
     joined = {key: np.concatenate([view[key] for view in counted]) for key in counted[0]}
-    return scene.root.name, {**scores(joined, scene), **times(trained), "training": training_share(run)}
+    names = scene.material_names or [str(number) for number in range(len(trained.materials.names))]
+    joined |= of_endmembers(
+        trained.endmember_interval, trained.materials.endmembers, scene_truth(scene).endmembers
+    )
+    found = {**scores(joined, names), **times(trained), "training": training_share(run)}
+    return scene.root.name, found | {"area": areas(trained, scene, names)}
 
 
 def of_view(trained: TrainedScene, scene: Scene, index: int) -> dict[str, np.ndarray]:
@@ -172,16 +208,105 @@ def of_view(trained: TrainedScene, scene: Scene, index: int) -> dict[str, np.nda
     }
     for key, (name, value, target) in asked.items():
         value, target = value.cpu()[counts], target.cpu()[counts]
-        found[f"{key} error"] = (value - target).abs().numpy()
-        if key == "abundances":
-            found["there"] = (torch.maximum(value, target) > _THERE).numpy()
-        for coverage in COVERAGES:
-            low, high = (ends_.cpu() for ends_ in ends_of(name, trained)(seen, coverage))
-            low, high = (one[..., own] if key == "abundances" else one for one in (low, high))
-            low, high = (one[counts].view(len(value), -1) for one in (low, high))
-            inside = (low - _ROUNDING <= target) & (target <= high + _ROUNDING)
-            found[f"{key} {coverage:.0%}"] = inside.numpy()
-            found[f"{key} half {coverage:.0%}"] = ((high - low) / 2).numpy()
+        order = own if key == "abundances" else slice(None)
+
+        def ends(coverage: float, name: str = name, order: Any = order) -> list[np.ndarray]:
+            both = (one.cpu() for one in ends_of(name, trained)(seen, coverage))
+            return [(one if one.dim() == 3 else one[..., None])[..., order][counts].numpy() for one in both]
+
+        found |= counted(key, value.numpy(), target.numpy(), ends)
+    return found
+
+
+Ends = Callable[[float], Sequence[np.ndarray]]
+"""From a coverage to low and high ends."""
+
+
+def counted(key: str, values: np.ndarray, true: np.ndarray, ends: Ends) -> dict[str, np.ndarray]:
+    """Errors of values, half widths, and whether intervals hold what is true."""
+    found = {f"{key} error": np.abs(values - true)}
+    if key == "abundances":
+        found["there"] = np.maximum(values, true) > _THERE
+    for coverage in COVERAGES:
+        low, high = ends(coverage)
+        found[f"{key} {coverage:.0%}"] = (low - _ROUNDING <= true) & (true <= high + _ROUNDING)
+        found[f"{key} half {coverage:.0%}"] = (high - low) / 2
+    return found
+
+
+def of_endmembers(
+    interval: Callable[[float], Interval], found: torch.Tensor, true: torch.Tensor | None
+) -> dict[str, np.ndarray]:
+    """Of endmembers that are matched to true ones, these as bright as those, with errors relative to their length."""
+    assert true is not None
+    matching = match_endmembers(found.cpu().double(), true.double())
+    own = found.cpu().double()[list(matching.pred_ids)]
+    lengths = own.square().mean(dim=1, keepdim=True).sqrt()
+    target = true.double()[list(matching.true_ids)]
+    target = target / target.square().mean(dim=1, keepdim=True).sqrt()
+
+    def ends(coverage: float) -> list[np.ndarray]:
+        both = interval(coverage)
+        return [one[list(matching.pred_ids)] / lengths.numpy() for one in (both.low, both.high)]
+
+    return counted("endmembers", (own / lengths).numpy(), target.numpy(), ends)
+
+
+def of_image(pixels: np.ndarray, abundances: np.ndarray, endmembers: np.ndarray) -> dict[str, np.ndarray]:
+    """Of an image alone, (N, B), unmixed with defaults; as a square where it is one, for distances from edges."""
+    side = round(len(pixels) ** 0.5)
+    height, width = (side, side) if side**2 == len(pixels) else (1, len(pixels))
+    unmixed = unmix_image(pixels.reshape(height, width, -1).astype(np.float32), len(endmembers))
+    true = torch.from_numpy(abundances)
+    matching = match_endmembers(torch.from_numpy(unmixed.endmembers).double(), torch.from_numpy(endmembers))
+    own, order = list(matching.pred_ids), list(matching.true_ids)
+    counts = torch.from_numpy(unmixed.abundances.sum(axis=-1) > 0)
+    rows = counts.numpy()
+
+    def ends(coverage: float) -> list[np.ndarray]:
+        both = unmixed.interval(coverage)
+        return [one[rows][:, own] for one in (both.low, both.high)]
+
+    target = true.reshape(height, width, -1)
+    return {
+        "is_known": np.isfinite(unmixed.interval().low[rows]).all(axis=1),
+        "edge": edges(target, counts) if height > 1 else np.full(int(rows.sum()), np.nan),
+        "material": target.argmax(dim=-1)[counts].numpy(),
+        **counted("abundances", unmixed.abundances[rows][:, own], target[counts].numpy()[:, order], ends),
+        **of_endmembers(
+            unmixed.endmember_interval, torch.from_numpy(unmixed.endmembers), torch.from_numpy(endmembers)
+        ),
+    }
+
+
+def areas(trained: TrainedScene, scene: Scene, names: Sequence[str]) -> dict[str, Any]:
+    """Of each material: the part of the surface where it is the largest, its interval, and what is true of the places
+    that evaluation views show; of the others the run is believed. Square units of the world."""
+    surface = MeasuredSurface.of(trained)
+    positions = torch.from_numpy(surface.mesh.vertices).float()
+    of_vertex = vertex_areas(surface.areas, surface.mesh.faces, len(positions))
+    votes = torch.zeros(len(positions), len(names))
+    for index in scene.eval_indices:
+        camera, truth = scene.cameras[index], view_truth(scene, index)
+        assert truth.abundances is not None
+        inside, coords, _ = in_image(camera, positions)
+        seen = SeenSurface(trained, camera.width * camera.height, [camera]).shows(positions[inside])
+        columns, rows = coords[seen].long().unbind(dim=1)
+        votes[inside.nonzero()[seen, 0]] += truth.abundances[rows, columns].float()
+    true_endmembers = scene_truth(scene).endmembers
+    assert true_endmembers is not None
+    matching = match_endmembers(trained.materials.endmembers.cpu().double(), true_endmembers)
+    found, is_told = {}, votes.sum(dim=1) > _SEEN
+    for own, true in zip(matching.pred_ids, matching.true_ids, strict=True):
+        try:
+            measured = surface.measure(OfMaterial(own), names[true])
+        except ConfigError:  # it is the largest nowhere
+            continue
+        is_true = ((votes.argmax(dim=1) == true) & is_told).numpy()
+        target = float(of_vertex[is_true].sum() + measured.vertex_areas[~is_told.numpy()].sum())
+        interval = measured.area_interval
+        ends = None if interval.not_determined else [float(interval.low), float(interval.high)]
+        found[names[true]] = {"area": measured.area, "true": target, "interval": ends}
     return found
 
 
@@ -212,12 +337,18 @@ def edges(abundances: torch.Tensor, counts: torch.Tensor) -> np.ndarray:
     return np.asarray(distances)[counts.numpy()]
 
 
-def scores(joined: dict[str, np.ndarray], scene: Scene) -> dict[str, Any]:
-    """Coverage, half width and rank correlation of each quantity."""
-    there, found = joined["there"], {}
-    for key in ("abundances", "abundances there", "reflectance", "index"):
+def scores(joined: dict[str, np.ndarray], names: Sequence[str]) -> dict[str, Any]:
+    """Coverage, half width and rank correlation of each quantity, of what is determined."""
+    there, found = joined["there"] & np.isfinite(joined["abundances half 90%"]), {}
+    for key in QUANTITIES:
         name = key.removesuffix(" there")
-        chosen = there if key != name else np.isfinite(joined[f"{name} half 90%"])
+        if f"{name} error" not in joined:
+            continue
+        chosen = np.isfinite(joined[f"{name} half 90%"]) & np.isfinite(joined[f"{name} error"])
+        if not chosen.any():
+            continue
+        if key != name:
+            chosen &= there
         half, error = joined[f"{name} half 90%"][chosen], joined[f"{name} error"][chosen]
         some = np.random.default_rng(0).permutation(len(half))[:_MOST_RANKED]
         found[key] = {
@@ -236,7 +367,6 @@ def scores(joined: dict[str, np.ndarray], scene: Scene) -> dict[str, Any]:
         for low, high in pairwise(bounds)
         if there[(edge > low) & (edge <= high)].any()
     }
-    names = scene.material_names or tuple(map(str, range(int(joined["material"].max()) + 1)))
     found["by material"] = {
         name: float(inside[joined["material"] == number][there[joined["material"] == number]].mean())
         for number, name in enumerate(names)
@@ -271,8 +401,9 @@ def training_share(run: Path) -> dict[str, float]:
 def judged(measured: dict[str, Any]) -> list[_common.Figure]:
     """The lines of the table."""
     figures = []
-    for key in ("abundances", "abundances there", "reflectance", "index"):
-        covered = [values[key]["90"] for values in measured.values()]
+    for key in QUANTITIES:
+        having = [values[key] for values in measured.values() if key in values]
+        covered = [values["90"] for values in having]
         middle = float(np.median(covered))
         asked = f"{MEDIAN[0]:.2f} to {MEDIAN[1]:.2f}"
         figures += [
@@ -285,17 +416,26 @@ def judged(measured: dict[str, Any]) -> list[_common.Figure]:
             WORST.judge(f"{key}: in 90 % intervals, worst scene", min(covered)),
             RANK.judge(
                 f"{key}: rank correlation of width with error, median scene",
-                float(np.median([values[key]["rank"] for values in measured.values()])),
+                float(np.median([values["rank"] for values in having])),
             ),
         ]
     half = float(np.median([values["abundances"]["half width"] for values in measured.values()]))
+    told = [one for values in measured.values() for one in values.get("area", {}).values()]
+    inside = [one["interval"][0] <= one["true"] <= one["interval"][1] for one in told if one["interval"]]
+    figures.append(
+        _common.required(
+            "areas of materials in 90 % intervals, all scenes",
+            "0.86 to 0.94",
+            MEDIAN[0] <= np.mean(inside) <= MEDIAN[1],
+            f"{sum(inside)} of {len(inside)}",
+        )
+    )
+    times_ = [values for values in measured.values() if "map over render" in values]
     return [
         *figures,
         HALF_WIDTH.judge("mean half width of abundances, median scene", half),
-        RENDER.judge(
-            "a map of widths over a render, worst", max(v["map over render"] for v in measured.values())
-        ),
-        PROBE.judge("intervals of a probe, worst", max(v["probe seconds"] for v in measured.values())),
+        RENDER.judge("a map of widths over a render, worst", max(v["map over render"] for v in times_)),
+        PROBE.judge("intervals of a probe, worst", max(v["probe seconds"] for v in times_)),
     ]
 
 
@@ -311,7 +451,8 @@ def by_coverage(measured: dict[str, Any]) -> _common.DetailTable:
             f"{values['determined']:.3f}",
         ]
         for name, values in measured.items()
-        for key in ("abundances", "abundances there", "reflectance", "index")
+        for key in QUANTITIES
+        if key in values
     ]
     return _common.DetailTable("Shares of true values in intervals", headers, rows)
 
@@ -326,6 +467,23 @@ def by_material(measured: dict[str, Any]) -> _common.DetailTable:
     return _common.DetailTable(
         "Abundances there, in 90 % intervals, by main material", ["scene", "material", "share"], rows
     )
+
+
+def by_area(measured: dict[str, Any]) -> _common.DetailTable:
+    """The area of each material beside its interval and what is true."""
+    rows = [
+        [
+            name,
+            material,
+            f"{one['area']:.4g}",
+            f"{one['interval'][0]:.4g} to {one['interval'][1]:.4g}" if one["interval"] else "not determined",
+            f"{one['true']:.4g}",
+        ]
+        for name, values in measured.items()
+        for material, one in values.get("area", {}).items()
+    ]
+    headers = ["scene", "material", "area", "90 % interval", "true"]
+    return _common.DetailTable("Areas of materials, square units", headers, rows)
 
 
 def by_edge(measured: dict[str, Any]) -> _common.DetailTable:

@@ -290,7 +290,7 @@ class PlaceErrors:
         deviations = torch.where(is_known[:, None], (squares + _LEAST_SQUARE).sqrt(), torch.nan)
         deviations = deviations.reshape(*positions.shape[:-1], -1)
         edges = self.origin.new_tensor(_ABUNDANCE_EDGES)
-        levels = self.abundance_levels[torch.bucketize(abundances.to(edges), edges)]
+        levels = self.abundance_levels[torch.bucketize(abundances.to(edges).contiguous(), edges)]
         levels = levels.where(self.is_determined, torch.nan)
         lengths = spectra.to(self.origin).norm(dim=-1)
         of_spectra = (
