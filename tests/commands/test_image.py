@@ -57,7 +57,7 @@ def test_spectra_maps_and_shares_are_written_and_said(cube, tmp_path):
     assert "exist already; give --overwrite or another folder" in refused(image, *words)
     assert UNKNOWN_LIGHT not in done(image, *words[:-4], "--overwrite").out
     left = {path.name for path in folder.glob("[!.]*")}
-    assert (len(left), left & {"angles.csv", "mnf.csv", "mnf.hdr", "mnf.img"}) == (9, set())
+    assert (len(left), left & {"angles.csv", "mnf.csv", "mnf.hdr", "mnf.img"}) == (10, set())
 
 
 def test_files_that_only_other_options_write_are_not_taken_away_unasked(cube, tmp_path):
