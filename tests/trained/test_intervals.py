@@ -79,7 +79,7 @@ def test_of_errors_that_were_not_seen_as_many_are_within_as_the_coverage_says(co
     positions, deviations = places(5000, generator)
     fresh, local = pixel_errors(positions, deviations, generator), errors.at(positions, *known(5000))
     is_large = deviations > 0.05
-    half = width_factor(errors.abundance_factors, coverage) * local.abundances[:, :2]
+    half = errors.half_widths(fresh.abundances, local.abundances, coverage)[:, :2]
     of_spectra = (
         width_factor(errors.spectrum_factors, coverage) * local.spectra[:, None] * errors.band_deviations
     )
@@ -102,6 +102,23 @@ def test_what_is_the_same_everywhere_stays_in_the_mean_of_a_region_and_the_rest_
     assert float(own.abundances[:2].max()) < 0.2 * float(alone.abundances[:, :2].mean())
     assert float(shared.abundances[:2].min()) > 0.6 * float(alone.abundances[:, :2].square().mean().sqrt())
     assert own.abundances.isnan().tolist() == [False, False, True]
+
+
+def test_what_is_absent_has_narrower_intervals_than_what_is_there_where_its_errors_are_smaller():
+    generator = torch.Generator().manual_seed(1)
+    pixels = pixel_errors(*places(20_000, generator), generator)
+    abundances = torch.tensor([0.6, 0.4, 0.0]).expand(20_000, 3)
+    missed = torch.tensor([0.05, 0.05, 0.001]) * torch.randn(2, 20_000, 3, generator=generator)
+    missed[1] *= 2
+    some = replace(pixels, abundances=abundances, possible=abundances + missed)
+    errors = PlaceErrors.fit(some, torch.ones(3, NUM_BANDS), DEVIATIONS / 10, torch.zeros(3), PIXEL)
+    assert errors is not None
+    local = errors.at(pixels.positions, abundances, pixels.rendered)
+    half = errors.half_widths(abundances, local.abundances, 0.9).mean(dim=0)
+    torch.testing.assert_close(
+        half[:2], torch.full((2,), 1.645 * 0.1), rtol=0.1, atol=0
+    )  # of the further way
+    assert half[2] < 0.01
 
 
 def test_where_fewer_than_two_views_measured_errors_are_unknown():

@@ -42,8 +42,8 @@ class SeenPlaces:
 
     def of_abundances(self, coverage: float = COVERAGE) -> tuple[Tensor, Tensor]:
         """Low and high end of abundances; NaN where nothing is, or too few views measured."""
-        factor = width_factor(self.errors.scene.abundance_factors, coverage)
-        half = self._where_seen(factor * self.errors.abundances)
+        errors = self.errors
+        half = self._where_seen(errors.scene.half_widths(self.abundances, errors.abundances, coverage))
         return (self.abundances - half).clamp(0, 1), (self.abundances + half).clamp(0, 1)
 
     def of_spectra(self, coverage: float = COVERAGE) -> tuple[Tensor, Tensor]:

@@ -151,7 +151,7 @@ def read_errors(run: Path, steps: int, num_bands: int, num_endmembers: int) -> P
             raise ValueError(f"it has more than {_MOST_BYTES:,} bytes")
         with safe_open(path, "pt") as file:
             measured_at = int((file.metadata() or {}).get(_STEPS, -1))
-            if "endmember_deviations" not in file.keys():  # noqa: SIM118
+            if "absent_factors" not in file.keys():  # noqa: SIM118
                 return "errors.safetensors is of an earlier version: train the run on, with a larger limit"
             errors = PlaceErrors.of_tensors({name: file.get_tensor(name) for name in file.keys()})  # noqa: SIM118
         shapes = (errors.directions.shape[1], errors.large.sums.shape[1], errors.small.sums.shape[1])

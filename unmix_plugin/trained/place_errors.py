@@ -26,7 +26,7 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
-from unmix_plugin.spectral.intervals import is_determined, propagated_deviation, width_factors
+from unmix_plugin.spectral.intervals import is_determined, propagated_deviation, width_factor, width_factors
 
 CELL_SIZES_PX = (12.0, 3.0)
 """Edges of cells, in pixels as large as they are in the middle of the scene."""
@@ -43,8 +43,8 @@ _LEAST_SQUARE = 1e-7
 _INDEX_BITS = 20
 _HALF = 1 << (_INDEX_BITS - 1)
 _PRESENT = 0.05
-"""An abundance or what it is compared with has to be as large to decide how wide intervals are: an absent material is
-found to be absent, which says nothing of those that are there."""
+"""Abundance from which a material is there. Intervals of what is absent and of what is there have widths of their own:
+an absent material is found to be absent, which says nothing of those that are there."""
 _ABUNDANCE_EDGES = (0.01, 0.03, 0.1, 0.25, 0.5, 0.75, 0.9, 0.97)
 """Between groups of abundances."""
 _BRIGHTNESS_GROUPS = 10
@@ -171,8 +171,11 @@ class PlaceErrors:
     """Lengths of spectra between groups, radiance."""
     brightness_levels: Float[Tensor, "S 3"]
     """Errors of spectra of each group, their shape and their brightness, in multiples of what cells say."""
+    absent_factors: Float[Tensor, "L"]
+    """Half widths of intervals of abundances that are hardly there, in multiples of the deviation, for each of
+    COVERAGES."""
     abundance_factors: Float[Tensor, "L"]
-    """Half widths of intervals in multiples of the deviation, for each of COVERAGES."""
+    """The same of those that are there."""
     spectrum_factors: Float[Tensor, "L"]
     shape_factors: Float[Tensor, "L"]
     brightness_factors: Float[Tensor, "L"]
@@ -231,7 +234,10 @@ class PlaceErrors:
         )
 
         ratios = deviations.abs() / own
-        present = torch.maximum(abundances.expand_as(ratios), pixels.possible) > _PRESENT
+        is_there = abundances > _PRESENT
+        # What is there is measured against the mixtures that are furthest off: any may be the true ones.
+        told = is_there if is_there.any() else torch.ones_like(is_there)
+        of_ways = torch.stack([width_factors(one[told], generator) for one in ratios])
         eigen = torch.linalg.eigh(shape.T @ shape / len(shape))
         kept = slice(-min(_DIRECTIONS, shape.shape[1]), None)
         directions = (eigen.eigenvectors[:, kept] * eigen.eigenvalues[kept].clamp(min=0).sqrt()).T
@@ -241,6 +247,7 @@ class PlaceErrors:
         foreseen = propagated_deviation(contrasts, rendered[some], directions, of_shape[some])
 
         sizes = [CellGrid(origin, size * pixel_size).keys(pixels.positions) for size in _REGION_SIZES_PX]
+        absent = ratios[:, ~is_there].flatten()
         every_way = deviations.transpose(0, 1).flatten(1)
         of_bands = of_spectrum[:, None] * band_squares.sqrt()
         found = PlaceErrors(
@@ -258,9 +265,8 @@ class PlaceErrors:
             abundance_levels=abundance_levels,
             brightness_edges=brightness_edges,
             brightness_levels=brightness_levels,
-            abundance_factors=width_factors(
-                ratios[present] if present.any() else ratios.flatten(), generator
-            ),
+            absent_factors=width_factors(absent if len(absent) else ratios.flatten(), generator),
+            abundance_factors=of_ways.amax(dim=0),
             spectrum_factors=width_factors((spectra.abs() / of_bands).flatten(), generator),
             shape_factors=width_factors((missed / foreseen.clamp(min=1e-9)).flatten(), generator),
             brightness_factors=width_factors(brightness[:, 0].abs() / of_brightness, generator),
@@ -312,6 +318,13 @@ class PlaceErrors:
             for alike, values in ((of_abundances, local.abundances), (of_spectra, spectral))
         ]
         return LocalErrors(means[0], *means[1].unbind(), scene=self)
+
+    def half_widths(
+        self, abundances: Float[Tensor, "*places K"], deviations: Float[Tensor, "*places K"], coverage: float
+    ) -> Float[Tensor, "*places K"]:
+        """Of intervals of abundances, from their expected errors."""
+        absent, there = (width_factor(one, coverage) for one in (self.absent_factors, self.abundance_factors))
+        return torch.where(abundances > _PRESENT, there * deviations, absent * deviations)
 
     def alike(self, edge: float) -> tuple[float, float]:
         """Share of the squared errors of abundances, and of spectra, that is left in the mean over a region with this

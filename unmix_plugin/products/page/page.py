@@ -42,7 +42,7 @@ from unmix_plugin.products.scene_products import Page
 from unmix_plugin.products.views import draw_abundances, draw_segmentation
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.colour.conversion import describe_colour, rgb_matrix
-from unmix_plugin.spectral.intervals import COVERAGE, Interval, width_factor
+from unmix_plugin.spectral.intervals import COVERAGE, Interval
 from unmix_plugin.spectral.maps.indices import NAMED_INDICES, named_formula
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.measured_surface import MeasuredSurface
@@ -355,7 +355,7 @@ def _vertex_arrays(
     if not isinstance(errors, str):
         spectra = found.scaled_abundances @ scene.materials.endmembers.cpu()
         local = errors.at(positions, found.abundances, spectra).abundances.cpu()
-        half = width_factor(errors.abundance_factors, COVERAGE) * local
+        half = errors.half_widths(found.abundances.to(local), local, COVERAGE)
         arrays["half_widths"] = half.clamp(_LEAST_HALF_WIDTH, 1).nan_to_num(0.0).numpy()  # 0: not determined
     if scene.unexplained is not None:
         arrays["unexplained"] = scene.unexplained.at(positions).nan_to_num(0.0).numpy()
