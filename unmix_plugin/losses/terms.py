@@ -67,7 +67,7 @@ the densities."""
 _FINAL_ABUNDANCES = 0.1
 """Factor on the weight of abundances at the end of training: once materials are found, what is left of their
 disagreement with single pixels holds spectra back."""
-_FADES_UNTIL = {"sparsity": 0.25, "surface": 0.5, "certainty": 0.5, "normals": 1.0}
+_FADES_UNTIL = {"sparsity": 0.25, "surface": 0.5, "near": 0.5, "certainty": 0.5, "normals": 1.0}
 """Part of the training at which a weight has fallen to 0, slower and slower: later, sparsity would thin out surfaces,
 known surfaces would hold back what is finer, and pure materials may be pure."""
 _NOT_PUBLISHED = {"opacity", "sparsity", "surface", "near", "certainty"}
