@@ -55,6 +55,11 @@ def parse_xmp(packet: bytes | str) -> dict[str, str | list[str]]:
     if start < 0 or end < 0 or declares or end - start > _LARGEST_PACKET:
         return {}
     body = text[start:end] + "</rdf:RDF>" + ("</x:xmpmeta>" if start == opening else "")
+
+    def name_of(tag: str) -> str:
+        space, _, local = tag.removeprefix("{").rpartition("}")
+        return f"{prefixes.get(space, '')}:{local}"
+
     prefixes: dict[str, str] = {}
     tags: dict[str, str | list[str]] = {}
     level = 0
@@ -68,23 +73,12 @@ def parse_xmp(packet: bytes | str) -> dict[str, str | list[str]]:
             if event == "start-ns":
                 prefixes[item[1]] = item[0]
             elif event == "end" and item.tag == f"{_RDF}Description":
-                tags.update(_tags_of(item, prefixes))
+                tags |= {name_of(key): value.strip() for key, value in item.attrib.items()}
+                for child in item:
+                    listed = [(one.text or "").strip() for one in child.iter(f"{_RDF}li")]
+                    tags[name_of(child.tag)] = listed or (child.text or "").strip()
     except ElementTree.ParseError:
         return {}
-    return tags
-
-
-def _tags_of(description: ElementTree.Element, prefixes: dict[str, str]) -> dict[str, str | list[str]]:
-    def name_of(tag: str) -> str:
-        space, _, local = tag.removeprefix("{").rpartition("}")
-        return f"{prefixes.get(space, '')}:{local}"
-
-    tags: dict[str, str | list[str]] = {
-        name_of(key): value.strip() for key, value in description.attrib.items()
-    }
-    for child in description:
-        items = [(item.text or "").strip() for item in child.iter(f"{_RDF}li")]
-        tags[name_of(child.tag)] = items if items else (child.text or "").strip()
     return tags
 
 
@@ -97,7 +91,12 @@ def camera_tags(page_tags: Any) -> CameraTags:
     exif = {name: page_tags.valueof(name) for name in _EXIF_OF_PAGE}
     exif |= {name: _rational(page_tags.valueof(name)) for name in (*_EXPOSURE_OF_PAGE, *_FOCAL_PLANE_OF_PAGE)}
     exif |= {name: _rational(value) for name, value in (page_tags.valueof(_EXIF_CODE) or {}).items()}
-    exif["BlackLevel"] = _black_levels(page_tags.get(_BLACK_LEVEL_CODE))
+    exif["BlackLevel"] = None
+    if (tag := page_tags.get(_BLACK_LEVEL_CODE)) is not None:
+        levels = np.atleast_1d(np.asarray(tag.value, dtype=np.float64)).tolist()
+        if tag.dtype in _RATIONAL_TYPES:  # in one flat tuple of numerators and denominators
+            levels = [above / below for above, below in zip(levels[::2], levels[1::2], strict=True) if below]
+        exif["BlackLevel"] = levels
     known = {name: value for name, value in exif.items() if isinstance(value, (str, int, float, list))}
     plain = {name: int(value) if isinstance(value, int) else value for name, value in known.items()}
     return CameraTags(parse_xmp(page_tags.valueof(_XMP_CODE) or b""), plain)
@@ -109,16 +108,6 @@ def _rational(value: Any) -> Any:
     if not is_pair:
         return value
     return value[0] / value[1] if value[1] else None
-
-
-def _black_levels(tag: Any) -> list[float] | None:
-    """Stored as integers, or as rationals in one flat tuple of numerators and denominators."""
-    if tag is None:
-        return None
-    numbers = np.atleast_1d(np.asarray(tag.value, dtype=np.float64)).tolist()
-    if tag.dtype not in _RATIONAL_TYPES:
-        return numbers
-    return [above / below for above, below in zip(numbers[::2], numbers[1::2], strict=True) if below]
 
 
 def exif_number(exif: Mapping[str, Any], *names: str) -> float | None:

@@ -39,7 +39,6 @@ from unmix_plugin.scenes.demo.scene import (
 )
 from unmix_plugin.scenes.demo.shading import (
     MATERIALS,
-    Blend,
     Surface,
     Thing,
     band_centers_nm,
@@ -140,7 +139,15 @@ def make_demo_capture(
         camera, generator = _demo_line_camera(size, sampling.centers_nm, lamp), np.random.default_rng(1)
 
         def write(name: str, light: Float32[np.ndarray, "h W B"], what: str) -> None:
-            _write_counts(staging / name, camera.expose(light, generator), sampling, camera, what)
+            """NAME.hdr and NAME.raw, band-interleaved by line; the header marks some of the bad bands."""
+            counts = camera.expose(light, generator)
+            entries = cube_entries(
+                "ENVI Standard", f"{what}, raw counts", size, len(counts), bands, "bil", UINT16
+            )
+            entries |= wavelength_entries(sampling)
+            entries["bbl"] = [str(int(band not in camera.marked)) for band in range(bands)]
+            beside(staging / name, ".raw").write_bytes(counts.astype("<u2").transpose(0, 2, 1).tobytes())
+            beside(staging / name, ".hdr").write_bytes(header_bytes(entries))
 
         for name, level in (("dark", 0.0), ("white", 1.0)):
             write(name, np.full((_REFERENCE_LINES, size, bands), level, np.float32), f"{name} reference")
@@ -170,17 +177,11 @@ def marked_place(things: Sequence[Thing] | None = None) -> Place:
     """The table (or other things) with a board of markers around the plate, as seen by a lens that is wide enough.
     Raises ConfigError: OpenCV, which knows the markers, is not installed."""
     placement = PlacedPrimitive("box", (0.0, 0.0, _BOARD_TOP - 0.02), (_BOARD_REACH, _BOARD_REACH, 0.02))
-    board = Thing(placement, Surface("white", "purple", _print_of_markers()))
-    cameras = partial(demo_cameras, angle_deg=_BOARD_ANGLE_DEG)
-    return Place((*(things or speckled_things()), board), cameras)
-
-
-def _print_of_markers() -> Blend:
-    """Where the board is printed: 24 markers on a square of 7 a side, upright towards +y."""
     try:
         import cv2
     except ImportError as error:
         raise ConfigError(f"OpenCV, which prints markers, is not installed: {install_hint('sfm')}") from error
+    # Where the board is printed: 24 markers on a square of 7 a side, upright towards +y.
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, MARKER_FAMILY))
     cells = dictionary.markerSize + 2  # with the black border
     steps = [(i, j) for i in range(-3, 4) for j in range(-3, 4) if max(abs(i), abs(j)) == 3]
@@ -188,7 +189,7 @@ def _print_of_markers() -> Blend:
     printed_as = [cv2.aruco.generateImageMarker(dictionary, index, cells) for index in range(len(steps))]
     black = np.stack(printed_as) < 128
 
-    def blend(local_points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, " P"]:
+    def print_of(local_points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, " P"]:
         points = local_points[:, :2] * _BOARD_REACH
         nearest = np.abs(points[:, None] - middles).max(axis=2).argmin(axis=1)
         across, up = ((points - middles[nearest]) / MARKER_SIZE + 0.5).T
@@ -197,23 +198,9 @@ def _print_of_markers() -> Blend:
         printed = black[nearest, row.clip(0, cells - 1), column.clip(0, cells - 1)]
         return (printed & inside & (local_points[:, 2] > 0.999)).astype(local_points.dtype)
 
-    return blend
-
-
-def _write_counts(
-    path_without_suffix: Path,
-    counts: UInt16[np.ndarray, "h W B"],
-    bands: Bands,
-    camera: _LineCamera,
-    what: str,
-) -> None:
-    """Write NAME.hdr and NAME.raw, band-interleaved by line; the header marks some of the bad bands."""
-    height, width, num_bands = counts.shape
-    entries = cube_entries("ENVI Standard", f"{what}, raw counts", width, height, num_bands, "bil", UINT16)
-    entries |= wavelength_entries(bands)
-    entries["bbl"] = [str(int(band not in camera.marked)) for band in range(num_bands)]
-    beside(path_without_suffix, ".raw").write_bytes(counts.astype("<u2").transpose(0, 2, 1).tobytes())
-    beside(path_without_suffix, ".hdr").write_bytes(header_bytes(entries))
+    board = Thing(placement, Surface("white", "purple", print_of))
+    cameras = partial(demo_cameras, angle_deg=_BOARD_ANGLE_DEG)
+    return Place((*(things or speckled_things()), board), cameras)
 
 
 @dataclass(frozen=True)

@@ -549,23 +549,17 @@ def state_exposure(entries: Mapping[str, Any], where: str, remarks: list[Remark]
     if not is_exif:
         found = {factor: value for factor, value in found.items() if not factor.is_optional}
     f_number = found.get(_Exposed.F_NUMBER)
-    gain = _whole_gain(found, remarks)
-    return Exposure(found.get(_Exposed.TIME), gain, None if f_number is None else f_number.numbers[0])
-
-
-def _whole_gain(found: Mapping[_Exposed, Factor], remarks: list[Remark]) -> Factor | None:
-    """EXIF's speed, the whole gain, or the product of its parts."""
-    whole = found.get(_Exposed.SPEED, found.get(_Exposed.GAIN))
+    # The whole gain, as EXIF's speed or as it is, otherwise the product of its parts.
+    gain = found.get(_Exposed.SPEED, found.get(_Exposed.GAIN))
     parts = [found[part] for part in (_Exposed.ANALOG_GAIN, _Exposed.DIGITAL_GAIN) if part in found]
-    if whole is not None or not parts:
-        return whole
     sources = " and ".join(part.source for part in parts)
-    if len({len(part.numbers) for part in parts} - {1}) > 1:
+    if gain is None and len({len(part.numbers) for part in parts} - {1}) > 1:
         remarks.append(Remark.of(Code.GAIN_PARTS_MISFIT, entries=sources))
-        return None
-    product = np.multiply.reduce(np.broadcast_arrays(*(part.numbers for part in parts)))
-    assumed = next((part.assumed for part in parts if part.assumed), "")
-    return Factor(tuple(product.tolist()), sources, assumed)
+    elif gain is None and parts:
+        product = np.multiply.reduce(np.broadcast_arrays(*(part.numbers for part in parts)))
+        assumed = next((part.assumed for part in parts if part.assumed), "")
+        gain = Factor(tuple(product.tolist()), sources, assumed)
+    return Exposure(found.get(_Exposed.TIME), gain, None if f_number is None else f_number.numbers[0])
 
 
 def is_exposure(name: str) -> bool:

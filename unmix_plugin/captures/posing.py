@@ -190,11 +190,24 @@ def complete_rigs(
 ) -> tuple[dict[str, PosedCamera], list[Remark]]:
     """Cameras by view, also of views that get the pose of another lens of their shot, moved by the rig; and what
     was done with each lens."""
+    from scipy.spatial.transform import Rotation
+
     shots: dict[str, list[CaptureView]] = defaultdict(list)
     for view in views:
         if view.shot:
             shots[view.shot].append(view)
-    measured = _measured_offsets(shots, cameras)
+    # From the camera space of a second lens to that of a first, by the names of both, where both have poses in a shot:
+    # mean rotation, median place.
+    offsets: dict[tuple[str, str], list[_Pose]] = defaultdict(list)
+    for members in shots.values():
+        poses = {v.sensor: _square(cameras[v.name].camera_to_world) for v in members if v.name in cameras}
+        for first, second in permutations(poses, 2):
+            offsets[first, second].append(np.linalg.inv(poses[first]) @ poses[second])
+    measured = {}
+    for pair, those in offsets.items():
+        stacked, measured[pair] = np.stack(those), np.eye(4)
+        measured[pair][:3, :3] = Rotation.from_matrix(stacked[:, :3, :3]).mean().as_matrix()
+        measured[pair][:3, 3] = np.median(stacked[:, :3, 3], axis=0)
     lenses = {view.sensor: cameras[view.name].lens for view in views if view.name in cameras}
     completed, how = dict(cameras), Counter[tuple[str, Code]]()
     for members in shots.values():
@@ -214,27 +227,6 @@ def complete_rigs(
             code = Code.RIG_AS_FILES_SAY if by_files else code
             how[view.sensor, Code.RIG_AS_OTHER_SHOTS if by_poses else code] += 1
     return completed, [Remark.of(code, views=n, lens=sensor) for (sensor, code), n in how.items()]
-
-
-def _measured_offsets(
-    shots: Mapping[str, Sequence[CaptureView]], cameras: Mapping[str, PosedCamera]
-) -> dict[tuple[str, str], _Pose]:
-    """From the camera space of a second lens to that of a first, by the names of both, where both have poses in one
-    shot: mean rotation, median place."""
-    from scipy.spatial.transform import Rotation
-
-    found: dict[tuple[str, str], list[_Pose]] = defaultdict(list)
-    for members in shots.values():
-        posed = [view for view in members if view.name in cameras]
-        poses = {view.sensor: _square(cameras[view.name].camera_to_world) for view in posed}
-        for first, second in permutations(poses, 2):
-            found[first, second].append(np.linalg.inv(poses[first]) @ poses[second])
-    offsets = {}
-    for pair, those in found.items():
-        stacked, offsets[pair] = np.stack(those), np.eye(4)
-        offsets[pair][:3, :3] = Rotation.from_matrix(stacked[:, :3, :3]).mean().as_matrix()
-        offsets[pair][:3, 3] = np.median(stacked[:, :3, 3], axis=0)
-    return offsets
 
 
 def _stated_offset(base: CaptureView, view: CaptureView) -> _Pose | None:

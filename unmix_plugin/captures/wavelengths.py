@@ -73,7 +73,20 @@ def wavelengths_in_names(
         centres, widths, units = zip(*known, strict=True)
         fwhm = None if None in widths else np.array(widths)
         return np.array(centres), f"{'' if fwhm is None else 'ranges '}with the unit {units[0]}", fwhm
-    plain = _varying_numbers(names)
+    # Of each name the numbers outside of what all names begin with and end in, except counters and those with a unit
+    # that is none of wavelengths.
+    begin = len(names[0][: common_length(names)].rstrip("0123456789.,"))
+    backwards = [name[::-1] for name in names]
+    end = len(backwards[0][: common_length(backwards)].rstrip("0123456789.,"))
+    plain = [
+        [
+            match[1]
+            for match in _NUMBER.finditer(name)
+            if begin <= match.start() and match.end() <= len(name) - end
+            if not _COUNTER.search(name, 0, match.start()) and not _OTHER_UNIT.match(name, match.end())
+        ]
+        for name in names
+    ]
     if any(len(found) != 1 for found in plain):
         return None
     centres = np.array([float(found[0].replace(",", ".")) for found in plain])
@@ -117,24 +130,6 @@ def _nm(text: str, unit: str) -> float | None:
     texts = [text.replace(",", "."), text.replace(",", "") if _THOUSANDS.fullmatch(text) else "nan"]
     values = [round(float(one) * (nm_per_unit(unit) or 1.0), 6) for one in texts]
     return next((nm for nm in values if PLAUSIBLE_NM[0] <= nm <= PLAUSIBLE_NM[1]), None)
-
-
-def _varying_numbers(names: Sequence[str]) -> list[list[str]]:
-    """Of each name the numbers outside of what all names begin with and end in, except counters and those with a unit
-    that is none of wavelengths."""
-
-    begin = len(names[0][: common_length(names)].rstrip("0123456789.,"))
-    backwards = [name[::-1] for name in names]
-    end = len(backwards[0][: common_length(backwards)].rstrip("0123456789.,"))
-    return [
-        [
-            match[1]
-            for match in _NUMBER.finditer(name)
-            if begin <= match.start() and match.end() <= len(name) - end
-            if not _COUNTER.search(name, 0, match.start()) and not _OTHER_UNIT.match(name, match.end())
-        ]
-        for name in names
-    ]
 
 
 def parse_wavelengths(text: str) -> Float64[np.ndarray, " B"]:

@@ -8,7 +8,7 @@ Notation: `b` is 1, or the bands of a file.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -100,7 +100,7 @@ def compare_exposures(files: ExposedFiles) -> ComparedExposures:
         kept = Remark.of(Code.EXPOSURE_COUNTED_BEFORE, **files.range_and_unit, source=finished[0])
         return ComparedExposures(None, (kept,) if files.differ else ())
     misfits = _misfits(files)
-    doubts = [*_missing_units((*files.views, *files.whites)), *misfits]
+    doubts = _missing_units((*files.views, *files.whites)) + misfits
     why = _why_not(files, bool(misfits))
     if why is not None:
         return ComparedExposures(None, (*doubts, *why))
@@ -189,17 +189,19 @@ def _misfits(files: ExposedFiles) -> list[Remark]:
     return [Remark.of(Code.EXPOSURES_MISFIT, [*found], numbers=numbers, bands=bands)]
 
 
-def _missing_units(files: Iterable[Cube]) -> Iterator[Remark]:
+def _missing_units(files: Iterable[Cube]) -> list[Remark]:
     """Warnings where units are missing and matter."""
     exposures = [file.exposure for file in files if file.exposure.time is not None]
     times = {one.time for one in exposures if one.time is not None and one.time.source}
     gains = {one.gain for one in exposures if one.gain is not None and one.gain.source}
     has_some_units = any(time.assumed for time in times) and not all(time.assumed for time in times)
     gains_differ = len({(1.0,) if one.gain is None else one.gain.numbers for one in exposures}) > 1
+    remarks = []
     for name, factors, matters in (
         ("exposure times", times, has_some_units),
         ("gains", gains, gains_differ and any(gain.assumed for gain in gains)),
     ):
         if matters:
             sources = "; ".join(sorted({factor.description for factor in factors}))
-            yield Remark.of(Code.EXPOSURE_UNITS_MISSING, factor=name, sources=sources)
+            remarks.append(Remark.of(Code.EXPOSURE_UNITS_MISSING, factor=name, sources=sources))
+    return remarks

@@ -12,7 +12,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Bool, Float32, Float64
 
 from unmix_plugin.captures.camera_tags import radiometric_model
 from unmix_plugin.captures.cube import (
@@ -185,12 +185,28 @@ def open_reference(file: Cube, kind: ReferenceKind, cube: Cube) -> Reference:
             "as many"
         )
     require_comparable(file, cube)
-    mean, pattern = _column_means(file)
+    # Mean over lines, NaN where nothing was measured.
+    total, count = np.zeros((width, bands)), np.zeros((width, bands))
+    missing = np.zeros((height, width), bool)
+    step = max(1, _BLOCK_VALUES // (width * bands))
+    for first in range(0, height, step):
+        part = slice(first, min(first + step, height))
+        stored = file.read(part)
+        missing[part] = find_missing(stored, file, part)
+        values = stated_values(file, stored, part)
+        values[missing[part]] = np.nan
+        total += np.nansum(values, axis=0, dtype=np.float64)
+        count += np.isfinite(values).sum(axis=0)
+    precise = total / np.where(count > 0, count, np.nan)
+    mean = precise[None].astype(np.float32)
     if not np.isfinite(mean).all():
         raise CaptureError(
             f"{file.path}: the {kind.value} has columns without a measurement (NaN, infinite or no-data); take it again"
         )
-    if (height, width) == cube.shape[:2] and height > 1 and pattern > _MOST_PATTERN:
+    pattern = 0.0
+    if (height, width) == cube.shape[:2] and height > 1:
+        pattern = _pattern_of_rows(file, precise, missing)
+    if pattern > _MOST_PATTERN:
         how = f"pixel by pixel, as its rows differ ({pattern:.1f} times what noise explains)"
         return Reference(file, mean, True, how)
     lines = f"mean of {height} line{'s' if height > 1 else ''}"
@@ -198,9 +214,17 @@ def open_reference(file: Cube, kind: ReferenceKind, cube: Cube) -> Reference:
         return Reference(file, mean, False, f"{lines}, column by column")
     ratio = max(width, cube.shape[1]) / min(width, cube.shape[1])
     wider = f"it is {width} columns wide and the cubes {cube.shape[1]}"
-    if ratio == int(ratio) and width > 1:
+    if ratio == int(ratio) and width > 1:  # both lines span the same field
         how = f"{lines}, interpolated along the line: {wider}, as with another binning"
-        return Reference(file, _stretched(mean, cube.shape[1]), False, how)
+        if width > cube.shape[1]:  # finer than the cubes: average what falls into each of their pixels
+            mean = mean.reshape(1, cube.shape[1], width // cube.shape[1], -1).mean(axis=2)
+        else:
+            at = (np.arange(cube.shape[1]) + 0.5) * width / cube.shape[1] - 0.5
+            low = np.clip(np.floor(at).astype(int), 0, width - 1)
+            high = np.minimum(low + 1, width - 1)
+            part_way = np.clip(at - low, 0.0, 1.0)[None, :, None].astype(np.float32)
+            mean = mean[:, low] * (1 - part_way) + mean[:, high] * part_way
+        return Reference(file, mean, False, how)
     how = f"{lines} and of all columns: {wider}, so its columns can't be those of the cubes"
     return Reference(file, mean.mean(axis=1, keepdims=True), False, how)
 
@@ -243,23 +267,10 @@ def refuse_outside(what: str, rectangle: tuple[int, int, int, int], size: tuple[
         raise ConfigError(f"{where} leaves the image of {size[0]} rows and {size[1]} columns")
 
 
-def _column_means(file: Cube) -> tuple[Float32[np.ndarray, "1 W B"], float]:
-    """Mean over lines, and how much more than noise the rows differ, judged on a few bands: the variance of the means
-    of square blocks, as a multiple of what pixels that differ by noise alone would give."""
+def _pattern_of_rows(file: Cube, mean: Float64[np.ndarray, "W B"], missing: Bool[np.ndarray, "H W"]) -> float:
+    """How much more than noise the rows differ from their mean, judged on a few bands: the variance of the means of
+    square blocks, as a multiple of what pixels that differ by noise alone would give."""
     height, width, bands = file.shape
-    total, count = np.zeros((width, bands)), np.zeros((width, bands))
-    missing = np.zeros((height, width), bool)
-    step = max(1, _BLOCK_VALUES // (width * bands))
-    for first in range(0, height, step):
-        lines = slice(first, min(first + step, height))
-        stored = file.read(lines)
-        missing[lines] = find_missing(stored, file, lines)
-        values = stated_values(file, stored, lines)
-        values[missing[lines]] = np.nan
-        total += np.nansum(values, axis=0, dtype=np.float64)
-        count += np.isfinite(values).sum(axis=0)
-    mean = total / np.where(count > 0, count, np.nan)
-
     every, side, patterns = slice(0, height), _PATTERN_BLOCK_PX, []
     down, across = height // side, width // side
     for band in np.unique(np.linspace(0, bands - 1, 5).astype(int)):
@@ -272,19 +283,7 @@ def _column_means(file: Cube) -> tuple[Float32[np.ndarray, "1 W B"], float]:
             continue
         blocks = residual[: down * side, : across * side].reshape(down, side, across, side).mean(axis=(1, 3))
         patterns.append(float(blocks.var() * side * side / variance))
-    return mean[None].astype(np.float32), float(np.median(patterns))
-
-
-def _stretched(mean: Float32[np.ndarray, "1 V B"], width: int) -> Float32[np.ndarray, "1 W B"]:
-    """Linear interpolation along the line; both lines span the same field."""
-    found = mean.shape[1]
-    at = (np.arange(width) + 0.5) * found / width - 0.5
-    if found > width:  # finer than the cubes: average what falls into each of their pixels
-        return mean.reshape(1, width, found // width, -1).mean(axis=2)
-    low = np.clip(np.floor(at).astype(int), 0, found - 1)
-    high = np.minimum(low + 1, found - 1)
-    part = np.clip(at - low, 0.0, 1.0)[None, :, None].astype(np.float32)
-    return mean[:, low] * (1 - part) + mean[:, high] * part
+    return float(np.median(patterns))
 
 
 def _as_white(

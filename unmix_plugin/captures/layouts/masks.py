@@ -13,7 +13,7 @@ Folders below images/ are the same below masks/. Sources: colmap 2599, 3611; Ope
 from __future__ import annotations
 
 import unicodedata
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -36,23 +36,20 @@ def with_mask_files(capture: Capture) -> Capture:
             found = (folders.find(folder, name) for folder, name in candidates)
             mask = next((path for path in found if path is not None and path.resolve() not in images), None)
             if mask is None:
-                raise _no_mask(view, candidates)
+                places = [
+                    folder for folder in dict.fromkeys(folder for folder, _ in candidates) if folder.is_dir()
+                ]
+                names = [*dict.fromkeys(name for _, name in candidates if name.endswith(".png"))]
+                has_folder = any(folder.name in MASK_FOLDERS for folder in places)
+                raise CaptureError(
+                    f"--mask files: view {view.name} has no mask; expected an alpha channel, or a mask that is white "
+                    f"where the foreground is, for every view. Looked for {name_some(names, 6)} in "
+                    f"{name_some([str(folder) for folder in places], 6)}"
+                    + ("" if has_folder else "; there is no folder masks/ beside the images")
+                )
             view = replace(view, mask=mask)
         views.append(view)
     return replace(capture, views=tuple(views))
-
-
-def _no_mask(view: CaptureView, candidates: Sequence[tuple[Path, str]]) -> CaptureError:
-    """What to say where none of the files is there that could be the mask of a view."""
-    folders = [folder for folder in dict.fromkeys(folder for folder, _ in candidates) if folder.is_dir()]
-    names = [*dict.fromkeys(name for _, name in candidates if name.endswith(".png"))]
-    has_folder = any(folder.name in MASK_FOLDERS for folder in folders)
-    return CaptureError(
-        f"--mask files: view {view.name} has no mask; expected an alpha channel, or a mask that is white where the "
-        f"foreground is, for every view. Looked for {name_some(names, 6)} in "
-        f"{name_some([str(folder) for folder in folders], 6)}"
-        + ("" if has_folder else "; there is no folder masks/ beside the images")
-    )
 
 
 class _Folders:

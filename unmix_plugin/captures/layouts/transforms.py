@@ -24,7 +24,6 @@ import re
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal, TypeAlias
 
@@ -195,8 +194,9 @@ def find_nerfstudio(root: Path, options: ReadOptions) -> Capture:
     return _make_capture("nerfstudio", root, listed, views)
 
 
-def _find_cubes(layout: str, root: Path, options: ReadOptions) -> Capture:
-    """The views of a scene whose frames name cubes."""
+def find_unmix_nerf(root: Path, options: ReadOptions) -> Capture:
+    """The views of a scene of UnMix-NeRF, whose frames name cubes. Raises CaptureError: files are missing or outside of
+    the folder."""
     listed = _read_frames(root, CUBE_KEY)
     names = view_names([frame.text(CUBE_KEY) for frame in listed.frames], str(root))
     folders = [PurePosixPath(frame.name).parent.name for frame in listed.frames]
@@ -243,11 +243,7 @@ def _find_cubes(layout: str, root: Path, options: ReadOptions) -> Capture:
         notes.append(
             f"not taken over from transforms.json: {', '.join(not_copied)}; copy what still fits yourself"
         )
-    return _make_capture(layout, root, listed, views, notes, warnings)
-
-
-find_unmix_nerf = partial(_find_cubes, "unmix-nerf")
-"""Views of a scene of UnMix-NeRF; CaptureError where files are missing or lie outside of the folder."""
+    return _make_capture("unmix-nerf", root, listed, views, notes, warnings)
 
 
 def _in_eval(text: str) -> str:

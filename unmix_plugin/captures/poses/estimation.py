@@ -16,7 +16,7 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -135,31 +135,9 @@ def estimate_poses(
         "pictures": digest.hexdigest(),
     }
     found = _run(settings, folder)
-    return _best(found["models"], found["views"], files, folder)
-
-
-def _run(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Start the process that reconstructs, with its output in the log file; or take what an earlier try found."""
-    result, asked, wanted = folder / _RESULT, folder.resolve() / "settings.json", json.dumps(settings)
-    if result.is_file() and asked.is_file() and asked.read_text(encoding="utf-8") == wanted:
-        with contextlib.suppress(ValueError):  # cut short by a kill: found anew
-            return json.loads(result.read_text(encoding="utf-8"))
-    result.unlink(missing_ok=True)
-    asked.write_text(wanted, encoding="utf-8")
-    command = child_command("unmix_plugin.captures.poses.estimation", [str(asked)])
-    with (folder / _LOG).open("wb") as log:
-        ran = subprocess.run(command, stdout=log, stderr=log, stdin=subprocess.DEVNULL, check=False)
-    if ran.returncode != 0 or not result.is_file():
-        *_, last = ["without a word", *(folder / _LOG).read_text("utf-8", "replace").strip().splitlines()]
-        raise CaptureError(f"COLMAP stopped with status {ran.returncode} ({last}); see {folder / _LOG}")
-    return json.loads(result.read_text(encoding="utf-8"))
-
-
-def _best(
-    models: list[dict[str, Any]], views: dict[str, Any], files: Mapping[str, str], folder: Path
-) -> PoseSet:
-    """The model with the most views, that with the smaller error where two have as many."""
-    best = max(models, key=lambda model: (model["registered"], -model["error_px"]), default=None)
+    # The model with the most views, that with the smaller error where two have as many.
+    views = found["views"]
+    best = max(found["models"], key=lambda model: (model["registered"], -model["error_px"]), default=None)
     registered = 0 if best is None else best["registered"]
     if best is None or registered < max(_LEAST_VIEWS, _LEAST_SHARE * len(files)):
         findings, advice = _explain(views, files, folder)
@@ -177,6 +155,23 @@ def _best(
         notes.append(f"views without pose: {name_some(missing)}; matches with the nearest view: {matches}")
     notes += poses.notes
     return replace(poses, cameras=cameras, source="estimated by COLMAP", has_world=False, notes=tuple(notes))
+
+
+def _run(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Start the process that reconstructs, with its output in the log file; or take what an earlier try found."""
+    result, asked, wanted = folder / _RESULT, folder.resolve() / "settings.json", json.dumps(settings)
+    if result.is_file() and asked.is_file() and asked.read_text(encoding="utf-8") == wanted:
+        with contextlib.suppress(ValueError):  # cut short by a kill: found anew
+            return json.loads(result.read_text(encoding="utf-8"))
+    result.unlink(missing_ok=True)
+    asked.write_text(wanted, encoding="utf-8")
+    command = child_command("unmix_plugin.captures.poses.estimation", [str(asked)])
+    with (folder / _LOG).open("wb") as log:
+        ran = subprocess.run(command, stdout=log, stderr=log, stdin=subprocess.DEVNULL, check=False)
+    if ran.returncode != 0 or not result.is_file():
+        *_, last = ["without a word", *(folder / _LOG).read_text("utf-8", "replace").strip().splitlines()]
+        raise CaptureError(f"COLMAP stopped with status {ran.returncode} ({last}); see {folder / _LOG}")
+    return json.loads(result.read_text(encoding="utf-8"))
 
 
 def _explain(views: dict[str, Any], files: Mapping[str, str], folder: Path) -> tuple[str, str]:
@@ -206,16 +201,10 @@ def _explain(views: dict[str, Any], files: Mapping[str, str], folder: Path) -> t
         view, partner = views[file], names.get(views[file]["best"], "no other view")
         lines.append(f"{names[file]}: {view['features']}, {view['most']}, {partner}")
     (folder / _REPORT).write_text("\n".join(lines) + "\n", encoding="utf-8")
-    _draw_worst(folder, views, order[:_MOST_WORST])
-    return findings, "; ".join(tries)
-
-
-def _draw_worst(folder: Path, views: dict[str, Any], worst: Sequence[str]) -> None:
-    """Each of some views beside the one that shares most with it, and lines between matched points."""
     from PIL import Image, ImageDraw
 
-    rows = []
-    for file in worst:
+    rows = []  # each of the worst views beside the one that shares most with it, and lines between matched points
+    for file in order[:_MOST_WORST]:
         best = folder / "images" / (views[file]["best"] or file)
         with Image.open(folder / "images" / file) as first, Image.open(best) as second:
             row = Image.new("RGB", (first.width + second.width, max(first.height, second.height)))
@@ -229,6 +218,7 @@ def _draw_worst(folder: Path, views: dict[str, Any], worst: Sequence[str]) -> No
     for index, row in enumerate(rows):
         sheet.paste(row, (0, sum(above.height for above in rows[:index])))
     sheet.save(folder / _DRAWN)
+    return findings, "; ".join(tries)
 
 
 def contrast_picture(
@@ -276,13 +266,45 @@ def _reconstruct(path: Path) -> None:
     database, matched = folder / "database.db", folder / "matched.txt"
     if not (database.is_file() and matched.is_file() and matched.read_text() == settings["pictures"]):
         database.unlink(missing_ok=True)
-        _extract(pycolmap, settings, database)
-        _match(pycolmap, settings, database)
+        features = pycolmap.FeatureExtractionOptions()
+        features.num_threads, features.use_gpu = settings["threads"], False
+        features.sift.max_num_features, features.sift.peak_threshold = _MOST_FEATURES, _PEAK_THRESHOLD
+        reader = pycolmap.ImageReaderOptions()
+        reader.camera_model = "SIMPLE_RADIAL"  # a lens with one number of distortion
+        if settings["has_masks"]:
+            reader.mask_path = folder / "masks"
+        for names in settings["sensors"]:
+            pycolmap.extract_features(
+                database,
+                folder / "images",
+                image_names=names,
+                camera_mode=pycolmap.CameraMode.SINGLE,
+                reader_options=reader,
+                extraction_options=features,
+                device=pycolmap.Device.cpu,
+            )
+        matching, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
+        matching.num_threads, matching.use_gpu = settings["threads"], False
+        verification.ransac.random_seed = _SEED
+        match = pycolmap.match_sequential if settings["sequential"] else pycolmap.match_exhaustive
+        match(
+            database,
+            matching_options=matching,
+            verification_options=verification,
+            device=pycolmap.Device.cpu,
+        )
         matched.write_text(settings["pictures"])
     count = sum(map(len, settings["sensors"]))
     found: list[dict[str, Any]] = []
     for factor in _FOCAL_FACTORS:
-        _set_focal(pycolmap, database, factor)
+        # All lenses start from a focal length of so many times the longer side, without distortion.
+        with pycolmap.Database.open(database) as opened:
+            for camera in opened.read_all_cameras():
+                values = np.zeros(len(camera.params))
+                values[list(camera.focal_length_idxs())] = factor * max(camera.width, camera.height)
+                values[list(camera.principal_point_idxs())] = camera.width / 2, camera.height / 2
+                camera.params = values.tolist()
+                opened.update_camera(camera)
         found += _map(pycolmap, settings, database, folder / "models" / f"{factor:g}")
         if max((model["registered"] for model in found), default=0) >= _ENOUGH * count:
             break
@@ -316,48 +338,9 @@ def _matches_of_views(pycolmap: Any, database: Path) -> dict[str, Any]:
     return views
 
 
-def _extract(pycolmap: Any, settings: dict[str, Any], database: Path) -> None:
-    options = pycolmap.FeatureExtractionOptions()
-    options.num_threads, options.use_gpu = settings["threads"], False
-    options.sift.max_num_features, options.sift.peak_threshold = _MOST_FEATURES, _PEAK_THRESHOLD
-    reader, folder = pycolmap.ImageReaderOptions(), Path(settings["folder"])
-    reader.camera_model = "SIMPLE_RADIAL"  # a lens with one number of distortion
-    if settings["has_masks"]:
-        reader.mask_path = folder / "masks"
-    for names in settings["sensors"]:
-        pycolmap.extract_features(
-            database,
-            folder / "images",
-            image_names=names,
-            camera_mode=pycolmap.CameraMode.SINGLE,
-            reader_options=reader,
-            extraction_options=options,
-            device=pycolmap.Device.cpu,
-        )
-
-
-def _match(pycolmap: Any, settings: dict[str, Any], database: Path) -> None:
-    options = pycolmap.FeatureMatchingOptions()
-    options.num_threads, options.use_gpu = settings["threads"], False
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = _SEED
-    match = pycolmap.match_sequential if settings["sequential"] else pycolmap.match_exhaustive
-    match(database, matching_options=options, verification_options=verification, device=pycolmap.Device.cpu)
-
-
-def _set_focal(pycolmap: Any, database: Path, factor: float) -> None:
-    """Start all lenses from a focal length of so many times the longer side, without distortion."""
-    with pycolmap.Database.open(database) as opened:
-        for camera in opened.read_all_cameras():
-            values = np.zeros(len(camera.params))
-            values[list(camera.focal_length_idxs())] = factor * max(camera.width, camera.height)
-            values[list(camera.principal_point_idxs())] = camera.width / 2, camera.height / 2
-            camera.params = values
-            opened.update_camera(camera)
-
-
 def _map(pycolmap: Any, settings: dict[str, Any], database: Path, output: Path) -> list[dict[str, Any]]:
-    """Models from one first focal length, without distortion, which a few views of a far lens would let run away."""
+    """Models from one first focal length, without distortion, which a few views of a far lens would let run away; it is
+    refined afterwards, where that is better and stays small."""
     output.mkdir(parents=True, exist_ok=True)
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed = settings["threads"], _SEED
@@ -373,22 +356,18 @@ def _map(pycolmap: Any, settings: dict[str, Any], database: Path, output: Path) 
     found = []
     for number, model in models.items():
         place = output / str(number)
-        refined = _with_distortion(pycolmap, model)
+        refined = pycolmap.Reconstruction(model)
+        bundle = pycolmap.BundleAdjustmentOptions()
+        bundle.refine_extra_params, bundle.print_summary = True, False
+        pycolmap.bundle_adjustment(refined, bundle)
+        limit = (1.0 - _GAIN) * model.compute_mean_reprojection_error()
+        is_better = refined.compute_mean_reprojection_error() < limit
+        if not (is_better and all(map(_is_plausible, refined.cameras.values()))):
+            refined = model
         refined.write(place)
         error = refined.compute_mean_reprojection_error()
         found.append({"folder": str(place), "registered": refined.num_reg_images(), "error_px": error})
     return found
-
-
-def _with_distortion(pycolmap: Any, model: Any) -> Any:
-    """The model with distortion refined too, where that is better and stays small; otherwise as it was."""
-    refined = pycolmap.Reconstruction(model)
-    options = pycolmap.BundleAdjustmentOptions()
-    options.refine_extra_params, options.print_summary = True, False
-    pycolmap.bundle_adjustment(refined, options)
-    limit = (1.0 - _GAIN) * model.compute_mean_reprojection_error()
-    is_better = refined.compute_mean_reprojection_error() < limit
-    return refined if is_better and all(map(_is_plausible, refined.cameras.values())) else model
 
 
 def _is_plausible(camera: Any) -> bool:

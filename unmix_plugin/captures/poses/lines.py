@@ -4,7 +4,10 @@ scan: where the camera stood at its first line, and how a linear or a rotation s
 Which kind a table is shows in its columns. Positions are those of the camera, in a world in which what is looked at
 stands still; +z is up.
 
-Notation: `H` lines of a scan.
+A linear stage has a direction and a step a line or a speed, a rotation stage an axis, a point on it and a turn a line
+or a spin. The camera stands as a rotation says, or so that its line lies across the movement.
+
+Notation: `H` lines of a scan, `n` rows of its table.
 """
 
 from __future__ import annotations
@@ -21,9 +24,21 @@ from unmix_plugin.captures.cube import CaptureView
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.poses import line_motion
 from unmix_plugin.captures.poses.lens import Lens
-from unmix_plugin.captures.poses.line_stages import scans_of_stages
-from unmix_plugin.captures.poses.line_tables import MOST_TURN_RAD, ScanTable, TableRow, read_scan_table
-from unmix_plugin.captures.poses.line_tracks import scans_of_track
+from unmix_plugin.captures.poses.line_tables import (
+    AXIS,
+    CENTRE,
+    DIRECTION,
+    LOOK,
+    MATRIX,
+    MOST_TURN_RAD,
+    OF_STAGES,
+    PLACE,
+    QUATERNION,
+    ScanTable,
+    TableRow,
+    line_rate,
+    read_scan_table,
+)
 from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet, find_offset
 from unmix_plugin.engine.geometry.camera_paths import nearest_to_axes
 from unmix_plugin.errors import CaptureError, ConfigError, did_you_mean, name_some
@@ -35,6 +50,8 @@ _LARGEST_JUMP = 30.0
 """Of a line's movement over the usual one: more is a slip of the table, or of the stage."""
 _ANGLES_DEG = (0.01, 170.0)
 _LEAST_LINES = 2
+_WIDEST_GAP = 10.0
+"""Between neighbouring rows of a track, over the usual distance in time: more is a gap."""
 
 _Lines = Float64[np.ndarray, "H 3 4"]
 
@@ -61,12 +78,30 @@ def read_line_poses(views: Sequence[CaptureView], root: Path, options: ProcessOp
     tables, notes = _tables(views, root, options.poses)
     found: dict[str, _Lines] = {}
     for table, owner in tables:
-        is_track = any(name in table.columns for name in _OF_TRACKS)
         scans = _by_scan(table, views, owner, notes)
-        read = scans_of_track(table, scans, options) if is_track else scans_of_stages(scans, options)
-        for name, lines in read.items():
-            _require_movement(lines, name, table.path)
-            found[name] = lines.copy()
+        is_track = any(name in table.columns for name in _OF_TRACKS)
+        if is_track:
+            table.refuse_columns(OF_STAGES, "is one of stages, while the table has poses of lines")
+        if {*_OF_TRACKS} <= {*table.columns}:
+            table.refuse_columns(("time",), "says again what 'line' says")
+        for view, rows in scans:
+            if not is_track and len(rows) > 1:
+                raise CaptureError(
+                    f"{rows[1].where}: a second row for scan {view.name}; expected one, or a column 'line' or 'time' "
+                    "in a table with the pose of each line"
+                )
+            if is_track:
+                poses = np.stack([row.pose(options.camera_axes) for row in rows])
+                by_line = "line" in table.columns
+                lines = (
+                    poses[_order_of_lines(table, view, rows)]
+                    if by_line
+                    else _timed(table, view, rows, poses, options)
+                )
+            else:
+                lines = _staged(rows[0], view, options)
+            _require_movement(lines, view.name, table.path)
+            found[view.name] = lines.copy()
     units = {table.metres_per_unit for table, _ in tables}
     if len(units) > 1:
         paths = name_some([table.path.name for table, _ in tables])
@@ -147,6 +182,166 @@ def _by_scan(
     if unknown:
         notes.append(f"scans of {table.path.name} that are not there: {name_some(unknown)}")
     return found
+
+
+# Tracks: the poses of lines, a row each, or poses at moments, which are interpolated at the times of lines.
+
+
+def _order_of_lines(table: ScanTable, view: CaptureView, rows: Sequence[TableRow]) -> list[int]:
+    """Which row each line of the image has. Raises CaptureError: lines are missing, there twice, or too many."""
+    numbers = [row.cells.get("line", math.nan) for row in rows]
+    where, height = f"{table.path}, scan {view.name}", view.cube.shape[0]
+    odd = [row.where for row, number in zip(rows, numbers, strict=True) if not number.is_integer()]
+    if odd:
+        raise CaptureError(f"{odd[0]}: line is no whole number; expected 0, 1, 2, ...")
+    owners: dict[int, int] = {}
+    for index, number in enumerate(numbers):
+        if owners.setdefault(int(number), index) != index:
+            raise CaptureError(f"{where}: line {int(number)} is there twice; expected each once")
+    if 0 not in owners and len(owners) == max(owners) >= height:  # counted from 1
+        owners = {number - 1: index for number, index in owners.items()}
+    missing = [number for number in range(height) if number not in owners]
+    last = height + view.cube.dark_lines - 1
+    beyond = [number for number in sorted(owners) if not 0 <= number <= last]
+    if missing or beyond:
+        found = f"lacks {_ranges(missing)}" if missing else f"has {_ranges(beyond)}"
+        raise CaptureError(f"{where} {found}; expected lines 0 to {height - 1}, one row each")
+    return [owners[number] for number in range(height)]
+
+
+def _ranges(numbers: Sequence[int]) -> str:
+    """Lines in words.
+
+    >>> _ranges([3, 4, 5, 9])
+    'lines 3 to 5, 9'
+    """
+    starts = [number for number in numbers if number - 1 not in numbers]
+    ends = [number for number in numbers if number + 1 not in numbers]
+    parts = [f"{a}" if a == b else f"{a} to {b}" for a, b in zip(starts, ends, strict=True)]
+    return f"line{'s' * (len(numbers) > 1)} {name_some(parts)}"
+
+
+def _timed(
+    table: ScanTable,
+    view: CaptureView,
+    rows: Sequence[TableRow],
+    poses: Float64[np.ndarray, "n 3 4"],
+    options: ProcessOptions,
+) -> _Lines:
+    """Poses at the times of lines. Where there are as many rows as lines, each is that of a line."""
+    where, height = f"{table.path}, scan {view.name}", view.cube.shape[0]
+    times = np.array([row.cells.get("time", math.nan) for row in rows])
+    steps = np.diff(times)
+    if not np.isfinite(times).all() or not (steps > 0).all():
+        first = int(np.flatnonzero(~(np.append(steps > 0.0, np.isfinite(times[-1]))))[0])
+        raise CaptureError(f"{rows[first].where}: times must rise from row to row, and none may be empty")
+    if len(rows) in (height, height + view.cube.dark_lines):
+        return poses[:height]
+    if len(rows) < 2:
+        raise CaptureError(f"{where} has 1 row; expected 2 or more")
+    wide = int(steps.argmax())
+    if steps[wide] > _WIDEST_GAP * np.median(steps):
+        raise CaptureError(
+            f"{where} has no pose between {times[wide]:g} and {times[wide + 1]:g} s, while rows usually are "
+            f"{np.median(steps):.3g} s apart; scan again, or cut the scan there"
+        )
+    rate = line_rate(view, None, options, f"{where}: times of lines")
+    end = (height - 1) / rate
+    if times[0] > 1e-9 or times[-1] < end * (1 - 1e-9):
+        raise CaptureError(
+            f"{where} has times from {times[0]:g} to {times[-1]:g} s; the {height} lines take 0 to {end:g} s at "
+            f"{rate:g} a second: count time from the first line on, and name another unit, such as time (ms)"
+        )
+    return line_motion.at_times(times, poses, np.minimum(np.arange(height) / rate, times[-1]))
+
+
+# Stages: a row a scan, with where the camera stood at its first line and what the stage did.
+
+
+def _staged(row: TableRow, view: CaptureView, options: ProcessOptions) -> _Lines:
+    """Poses of a scan on the stage that a row describes."""
+    direction, axis, centre = (row.vector(names) for names in (DIRECTION, AXIS, CENTRE))
+    if (direction is None) == (axis is None):
+        found = "neither a direction nor an axis" if axis is None else "a direction and an axis"
+        raise CaptureError(
+            f"{row.where} has {found}; expected {DIRECTION[0]}, _y, _z of a linear stage, or {AXIS[0]}, _y, _z of a "
+            "rotation stage"
+        )
+    moves = row.words.get("moves", "").lower()
+    if moves not in ("camera", "object"):
+        found = f"is {moves!r}" if moves else "is missing"
+        raise CaptureError(
+            f"{row.where}: moves {found}; expected 'camera' or 'object', whichever the stage carries"
+        )
+    for name, vector in (("direction", direction), ("axis", axis)):
+        if vector is not None and not np.linalg.norm(vector) > 0:
+            raise CaptureError(f"{row.where}: {name} is 0, 0, 0; expected where it points")
+    sign = 1.0 if moves == "camera" else -1.0
+    height = view.cube.shape[0]
+    if direction is not None:
+        step = sign * _amount_a_line(row, ("step", "speed"), ("turn", "spin"), view, options)
+        way = direction / np.linalg.norm(direction) * step
+        return line_motion.moved_along(_first_pose(row, way, options), way, height)
+    assert axis is not None
+    if centre is None:
+        raise CaptureError(
+            f"{row.where} has no {CENTRE[0]}, _y, _z; expected a point on the axis of the stage"
+        )
+    place, look = row.vector(PLACE), row.vector(LOOK)
+    turn = sign * _amount_a_line(row, ("turn", "spin"), ("step", "speed"), view, options)
+    if abs(turn) > MOST_TURN_RAD:
+        raise CaptureError(
+            f"{row.where}: the stage turns by {math.degrees(abs(turn)):.3g} degrees from line to line; expected "
+            f"at most {math.degrees(MOST_TURN_RAD):g}: are these degrees a second (spin)?"
+        )
+    way = np.zeros(3)
+    if place is not None and look is not None:
+        way = line_motion.sweep_about(place, look, axis * math.copysign(1.0, turn), centre)
+    return line_motion.turned_about(_first_pose(row, way, options), axis, centre, turn, height)
+
+
+def _amount_a_line(
+    row: TableRow, names: tuple[str, str], others: tuple[str, str], view: CaptureView, options: ProcessOptions
+) -> float:
+    """How far a stage goes from line to line, by a column a line or one a second."""
+    if wrong := [name for name in others if name in row.cells]:
+        kind = "linear" if names[0] == "step" else "rotation"
+        raise CaptureError(f"{row.where}: a {kind} stage has no {wrong[0]}; expected {' or '.join(names)}")
+    a_line, a_second = (row.cells.get(name) for name in names)
+    if (a_line is None) == (a_second is None):
+        raise CaptureError(
+            f"{row.where} has {'no' if a_line is None else 'both'} {' and '.join(names)}; expected one"
+        )
+    amount = a_line if a_line is not None else 0.0
+    if a_second is not None:
+        amount = a_second / line_rate(view, row, options, f"{row.where}: {names[1]}: movements a second")
+    if amount == 0.0:
+        raise CaptureError(
+            f"{row.where}: the stage does not move; expected a {' or a '.join(names)} other than 0"
+        )
+    return amount
+
+
+def _first_pose(
+    row: TableRow, way: Float64[np.ndarray, "3"], options: ProcessOptions
+) -> Float64[np.ndarray, "3 4"]:
+    """The pose of a scan's first line: by a rotation, or by where the camera looks and the way it goes."""
+    place, look = row.vector(PLACE), row.vector(LOOK)
+    if look is None:
+        return row.pose(options.camera_axes)
+    if place is None or row.vector(QUATERNION) is not None or row.vector(MATRIX) is not None:
+        raise CaptureError(
+            f"{row.where} has {LOOK[0]} beside a rotation, or no x, y, z; expected one of both"
+        )
+    if not np.linalg.norm(look) > 0:
+        raise CaptureError(f"{row.where}: look is 0, 0, 0; expected where the camera looks")
+    pose = line_motion.looking(place, look, way, math.degrees(row.cells.get("roll", 0.0)))
+    if pose is None:
+        raise CaptureError(
+            f"{row.where}: the camera looks along its own movement, so that lines would not leave each other; expected "
+            "the direction of the stage across the view"
+        )
+    return pose
 
 
 # What looks wrong in poses of all kinds.

@@ -16,7 +16,6 @@ Sensor.location; agisoft-llc/metashape-scripts 78.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -124,7 +123,11 @@ def _aligned(chunk: _Element, path: Path, notes: list[str]) -> list[_Aligned]:
         matrix, component = _matrix(camera, path), camera.get("component_id")
         master = by_id.get(camera.get("master_id") or "")  # one that is disabled serves, too
         if matrix is None and master is not None and (of_master := _matrix(master, path)) is not None:
-            matrix, component = _beside_master(of_master, master, camera, offsets), master.get("component_id")
+            # The master of a shot may have another sensor than the system's.
+            own, others = camera.get("sensor_id"), master.get("sensor_id")
+            if own != others and own in offsets and others in offsets:
+                matrix = of_master @ np.linalg.inv(offsets[others]) @ offsets[own]
+                component = master.get("component_id")
             followers += matrix is not None
         if matrix is None:
             missing.append(camera)
@@ -181,19 +184,6 @@ def _offsets(chunk: _Element, where: str) -> dict[str | None, Float64[np.ndarray
     return offsets
 
 
-def _beside_master(
-    matrix: Float64[np.ndarray, "4 4"],
-    master: _Element,
-    camera: _Element,
-    offsets: Mapping[str | None, Float64[np.ndarray, "4 4"]],
-) -> Float64[np.ndarray, "4 4"] | None:
-    """The matrix of a camera by its master's. The master of a shot may have another sensor than the system's."""
-    of_camera, of_master = offsets.get(camera.get("sensor_id")), offsets.get(master.get("sensor_id"))
-    if of_camera is None or of_master is None or camera.get("sensor_id") == master.get("sensor_id"):
-        return None
-    return matrix @ np.linalg.inv(of_master) @ of_camera
-
-
 def _similarity(element: _Element, where: str) -> Float64[np.ndarray, "4 4"]:
     """rotation, translation and scale of an element, or its 16 numbers."""
     if len(element) == 0:
@@ -241,9 +231,18 @@ def _lens_metashape(sensor: _Element, where: str, notes: list[str]) -> Lens | No
         )
     if calibration is None:
         notes.append(f"sensor {name} is not calibrated: nominal focal length")
-        calibration = _nominal_calibration(sensor)
-    if calibration is None:
-        return None
+        # By focal length and size of a pixel in mm.
+        texts, keys = _properties(sensor), ("focal_length", "pixel_width", "pixel_height")
+        try:
+            focal, *sides = (float(texts[key]) for key in keys)
+        except (KeyError, ValueError):
+            return None
+        if not 0 < min(focal, *sides) <= max(focal, *sides) < np.inf:
+            return None
+        calibration = ElementTree.Element("calibration")
+        across, down = (focal / side for side in sides)
+        for tag, value in (("f", down), ("b1", across - down)):
+            ElementTree.SubElement(calibration, tag).text = repr(value)
     if calibration.find("f") is None and calibration.find("fx") is not None:
         raise CaptureError(
             f"{where} has <fx> and <fy>, as PhotoScan up to 1.3 wrote them, which is not read; open the project in "
@@ -259,7 +258,13 @@ def _lens_metashape(sensor: _Element, where: str, notes: list[str]) -> Lens | No
             f"{where} has the principal point {center_x:g}, {center_y:g}, outside its {width} x {height} pixels; check "
             "<cx>, <cy> and <resolution> in the file"
         )
-    notes += _unknown_terms(calibration, name)
+    unknown = []
+    for child in calibration:
+        with suppress(ValueError):
+            if child.tag not in _TERMS and float(child.text or ""):
+                unknown.append(child.tag)
+    if unknown:
+        notes.append(f"sensor {name}: numbers that are not known and not used: {name_some(unknown)}")
     tangential = (values["p2"], values["p1"])
     start, growth = Lens(width, height, (f_x, f_y), (center_x, center_y)), (values["p3"], values["p4"])
     k1, k2, k3, k4 = (values[key] for key in _RADIAL)
@@ -275,17 +280,6 @@ def _lens_metashape(sensor: _Element, where: str, notes: list[str]) -> Lens | No
     terms = " and ".join(term for term, is_there in more.items() if is_there)
     model = "fisheye" if kind == "fisheye" else f"with {terms}"
     return fit_lens(distorted_and_skewed, start, f"Metashape {model} of sensor {name}", where)
-
-
-def _unknown_terms(calibration: _Element, name: str) -> list[str]:
-    """A note that names numbers of a calibration that are not followed, if there are any."""
-    unknown = []
-    for child in calibration:
-        with suppress(ValueError):
-            if child.tag not in _TERMS and float(child.text or ""):
-                unknown.append(child.tag)
-    note = f"sensor {name}: numbers that are not known and not used: {name_some(unknown)}"
-    return [note] if unknown else []
 
 
 def _calibration_metashape(sensor: _Element, where: str) -> tuple[_Element | None, tuple[int, int]]:
@@ -304,19 +298,3 @@ def _calibration_metashape(sensor: _Element, where: str) -> tuple[_Element | Non
 
 def _properties(sensor: _Element) -> dict[str | None, str]:
     return {element.get("name"): element.get("value", "") for element in sensor.findall("property")}
-
-
-def _nominal_calibration(sensor: _Element) -> _Element | None:
-    """By focal length and size of a pixel in mm; None where they are not given."""
-    texts = _properties(sensor)
-    try:
-        focal, *sides = (float(texts[name]) for name in ("focal_length", "pixel_width", "pixel_height"))
-    except (KeyError, ValueError):
-        return None
-    if not 0 < min(focal, *sides) <= max(focal, *sides) < np.inf:
-        return None
-    calibration = ElementTree.Element("calibration")
-    across, down = (focal / side for side in sides)
-    for tag, value in (("f", down), ("b1", across - down)):
-        ElementTree.SubElement(calibration, tag).text = repr(value)
-    return calibration

@@ -12,7 +12,6 @@ from typing import TypeAlias
 from xml.etree import ElementTree
 
 import numpy as np
-from jaxtyping import Float64
 
 from unmix_plugin.captures.poses.lens import Lens, Points, distort_brown, fit_lens
 from unmix_plugin.captures.poses.pose_set import (
@@ -58,8 +57,16 @@ def read_micmac(paths: list[Path]) -> PoseSet:
     for path in paths:
         orientation = _element_micmac(path, "OrientationConique")
         lens = _lens_micmac(orientation, path, lenses)
-        name = path.name.removeprefix(_PREFIX).removesuffix(".xml")
-        raw.append((name, PosedCamera(_pose_micmac(orientation, str(path)), lens)))
+        where, name = str(path), path.name.removeprefix(_PREFIX).removesuffix(".xml")
+        stated = [orientation.findtext(f"{holder}/KnownConv") for holder in ("ConvOri", "Externe")]
+        _require_known("convention", next(filter(None, stated), None), _CONVENTION, where)
+        _require_known("projection", orientation.findtext("TypeProj"), _PROJECTION, where)
+        center = numbers_in(orientation.find("Externe/Centre"), 3, where)
+        code = orientation.find("Externe/ParamRotation/CodageMatr")
+        rows = [None if code is None else numbers_in(code.find(tag), 3, where) for tag in ("L1", "L2", "L3")]
+        if center is None or any(row is None for row in rows):
+            raise CaptureError(f"{where}: <Centre> or the rotation's <L1>, <L2>, <L3> are missing")
+        raw.append((name, PosedCamera(np.column_stack([np.array(rows) @ FLIP, center]), lens)))
     is_far = find_offset(np.stack([camera.camera_to_world[:, 3] for _, camera in raw])).any()
     up = np.array([0.0, 0.0, 1.0]) if is_far else None
     folder = paths[0].parent
@@ -73,18 +80,6 @@ def _element_micmac(path: Path, tag: str) -> _Element:
     if found is None:
         raise CaptureError(f"{path} holds no <{tag}> of MicMac")
     return found
-
-
-def _pose_micmac(orientation: _Element, where: str) -> Float64[np.ndarray, "3 4"]:
-    stated = [orientation.findtext(f"{holder}/KnownConv") for holder in ("ConvOri", "Externe")]
-    _require_known("convention", next(filter(None, stated), None), _CONVENTION, where)
-    _require_known("projection", orientation.findtext("TypeProj"), _PROJECTION, where)
-    center = numbers_in(orientation.find("Externe/Centre"), 3, where)
-    code = orientation.find("Externe/ParamRotation/CodageMatr")
-    rows = [None if code is None else numbers_in(code.find(tag), 3, where) for tag in ("L1", "L2", "L3")]
-    if center is None or any(row is None for row in rows):
-        raise CaptureError(f"{where}: <Centre> or the rotation's <L1>, <L2>, <L3> are missing")
-    return np.column_stack([np.array(rows) @ FLIP, center])
 
 
 def _require_known(what: str, found: str | None, expected: str, where: str) -> None:
@@ -107,7 +102,17 @@ def _lens_micmac(orientation: _Element, path: Path, lenses: dict[tuple[str, _Shi
                 raise CaptureError(f"{path} names the calibration {name!r}; copy it into {path.parent}")
             inner = _element_micmac(file, "CalibrationInternConique")
         lens = _calibration_micmac(inner, str(file))
-        lenses[key] = _cut_micmac(lens, inner, shift, str(file)) if any(shift) else lens
+        if any(
+            shift
+        ):  # a picture cut out of the calibrated one, as ClipChantier does: <SzIm> stays that of the whole
+            size = numbers_in(inner.find("PixelSzIm"), 2, str(file))
+            if size is None or size.min() < 1 or size.max() > 1e6:
+                raise CaptureError(
+                    f"{file}: <OrIntImaM2C> says that the picture was cut, and no <PixelSzIm> of the calibration how "
+                    "large it is; add its width and height"
+                )
+            lens = lens.seen_as(int(size[0]), int(size[1]), (-shift[0], -shift[1]), (1.0, 1.0))
+        lenses[key] = lens
     return lenses[key]
 
 
@@ -124,17 +129,6 @@ def _shift_micmac(affinity: _Element | None, where: str) -> _Shift:
             "pictures (ReSampFid) and orient them again"
         )
     return float(shift[0]), float(shift[1])
-
-
-def _cut_micmac(lens: Lens, inner: _Element, shift: _Shift, where: str) -> Lens:
-    """The lens of a picture cut out of the calibrated one, as ClipChantier does: <SzIm> stays that of the whole."""
-    size = numbers_in(inner.find("PixelSzIm"), 2, where)
-    if size is None or size.min() < 1 or size.max() > 1e6:
-        raise CaptureError(
-            f"{where}: <OrIntImaM2C> says that the picture was cut, and no <PixelSzIm> of the calibration how large it "
-            "is; add its width and height"
-        )
-    return lens.seen_as(int(size[0]), int(size[1]), (-shift[0], -shift[1]), (1.0, 1.0))
 
 
 def _calibration_micmac(inner: _Element, where: str) -> Lens:

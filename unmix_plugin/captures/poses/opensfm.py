@@ -60,13 +60,20 @@ def read_opensfm(path: Path, content: Any) -> PoseSet:
         matrix = np.column_stack([rotation @ FLIP, -rotation @ pose[:, 3]])
         raw.append((name, PosedCamera(matrix, lenses[camera])))
     notes += [f"{len(loose)} shots have no pose: {name_some(loose)}"] if loose else []
+    points = list(_object(best, "points").values())
+    sparse: SparsePoints | None = None
+    if points:
+        found = [read_numbers(p.get("coordinates"), 3) if isinstance(p, dict) else None for p in points]
+        if any(position is None for position in found):
+            raise CaptureError(f"{path}: a point has no 3 finite 'coordinates'; the file is damaged")
+        colours = [read_numbers(point.get("color"), 3) for point in points]
+        known = [np.zeros(3) if colour is None else np.clip(colour, 0, 255) for colour in colours]
+        sparse = np.array(found), np.array(known).round().astype(np.uint8)
     up = np.array([0.0, 0.0, 1.0])
-    found = make_pose_set(raw, f"OpenSfM's {path.name}", str(path), _points(best, str(path)), up, notes)
-    origin = _object(
-        best, "reference_lla"
-    )  # of metres to the east, north and up; 0 where pictures had no place
+    made = make_pose_set(raw, f"OpenSfM's {path.name}", str(path), sparse, up, notes)
+    origin = _object(best, "reference_lla")  # of metres east, north and up; 0 where pictures had no place
     has_place = any(origin.get(key) for key in ("latitude", "longitude"))
-    return replace(found, metres_per_unit=1.0 if has_place else None)
+    return replace(made, metres_per_unit=1.0 if has_place else None)
 
 
 def _world_to_camera(
@@ -127,20 +134,6 @@ def _lens_opensfm(values: dict[str, Any], where: str) -> lens.Lens:
         return replace(start, distortion=(k1, k2, p1, p2), higher_radial=(k3, 0.0))
     terms = [number(key, 1.0 if key == "transition" else 0.0) for key in keys.split()]
     return lens.distorted_lens(distort, terms, start, kind, where)
-
-
-def _points(content: dict[str, Any], where: str) -> SparsePoints | None:
-    points = list(_object(content, "points").values())
-    positions = [
-        read_numbers(point.get("coordinates"), 3) if isinstance(point, dict) else None for point in points
-    ]
-    if not points:
-        return None
-    if any(position is None for position in positions):
-        raise CaptureError(f"{where}: a point has no 3 finite 'coordinates'; the file is damaged")
-    colours = [read_numbers(point.get("color"), 3) for point in points]
-    known = [np.zeros(3) if colour is None else np.clip(colour, 0, 255) for colour in colours]
-    return np.array(positions), np.array(known).round().astype(np.uint8)
 
 
 def _object(content: dict[str, Any], key: Any) -> dict[str, Any]:

@@ -172,7 +172,15 @@ def make_pose_set(
     Raises:
         CaptureError: a name twice with different poses, a matrix that is no pose, or a lens that is none.
     """
-    unique, repeated = _unique(cameras, where)
+    unique: dict[str, PosedCamera] = {}
+    repeated: list[str] = []
+    for name, camera in cameras:
+        first = unique.setdefault(name, camera)
+        if first is camera:
+            continue
+        if not np.array_equal(first.camera_to_world, camera.camera_to_world) or first.lens != camera.lens:
+            raise CaptureError(f"{where} has two cameras of the name {name} with different poses; rename one")
+        repeated.append(name)
     rigid, scales = _rigid(unique, where)
     offset = find_offset(rigid[:, :, 3])
     rigid[:, :, 3] -= offset
@@ -223,21 +231,6 @@ def find_offset(positions: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "3
     distance = float(np.linalg.norm(middle))
     is_far = distance > _FAR * spread if spread > 0 else distance > _FAR_ALONE
     return np.round(middle) if is_far else np.zeros(3)
-
-
-def _unique(
-    cameras: Iterable[tuple[str, PosedCamera]], where: str
-) -> tuple[dict[str, PosedCamera], list[str]]:
-    unique: dict[str, PosedCamera] = {}
-    repeated: list[str] = []
-    for name, camera in cameras:
-        first = unique.setdefault(name, camera)
-        if first is camera:
-            continue
-        if not np.array_equal(first.camera_to_world, camera.camera_to_world) or first.lens != camera.lens:
-            raise CaptureError(f"{where} has two cameras of the name {name} with different poses; rename one")
-        repeated.append(name)
-    return unique, repeated
 
 
 def _rigid(

@@ -1,4 +1,4 @@
-"""Poses of any program that we know, found by content. Read here: LLFF's, and transforms.json, which may be
+"""Poses of any program that we know, found by content. Read here: LLFF's, Polycam's, and transforms.json, which may be
 nerfstudio's, Blender's with `camera_angle_x`, a bare list, or have rotations with scale.
 """
 
@@ -22,7 +22,6 @@ from unmix_plugin.captures.poses.lens import Lens, distorted_lens
 from unmix_plugin.captures.poses.metashape import read_metashape
 from unmix_plugin.captures.poses.micmac import find_orientations, read_micmac
 from unmix_plugin.captures.poses.opensfm import read_opensfm
-from unmix_plugin.captures.poses.polycam import find_polycam, is_polycam, read_polycam
 from unmix_plugin.captures.poses.pose_set import (
     FLIP,
     PosedCamera,
@@ -37,10 +36,10 @@ from unmix_plugin.captures.poses.realitycapture import is_realitycapture, read_r
 from unmix_plugin.errors import CaptureError, counted, name_some
 from unmix_plugin.formats.json_values import describe, read_number, read_numbers
 from unmix_plugin.formats.meshes import read_ply_points
-from unmix_plugin.limits import open_regular
+from unmix_plugin.limits import allow_parts, open_regular
 from unmix_plugin.scenes.folder import Transforms, parse_transforms, unfollowed_keys
 from unmix_plugin.scenes.frame_cameras import Intrinsics, read_lens
-from unmix_plugin.scenes.placement import Placement, read_placement
+from unmix_plugin.scenes.placement import read_placement
 from unmix_plugin.scenes.reading.cubes import UnreadableArrayError, map_array, read_array_header
 from unmix_plugin.scenes.reading.faults import FILE_NAME, Faults, find_named
 from unmix_plugin.scenes.reading.images import FORMATS
@@ -86,8 +85,8 @@ def _read_file(path: Path, given: Mapping[str, _Size]) -> PoseSet:
 
 def _read_json(path: Path, given: Mapping[str, _Size]) -> PoseSet:
     content = load_json(path)
-    if is_polycam(content):
-        return read_polycam(find_polycam(path.parent) or [path])
+    if _is_polycam(content):
+        return _read_polycam(_find_polycam(path.parent) or [path])
     frames = content if isinstance(content, list) else []  # a bare list of those of transforms.json
     has_frames = any(isinstance(frame, dict) and "transform_matrix" in frame for frame in frames)
     if has_frames or (isinstance(content, dict) and "frames" in content):
@@ -125,8 +124,8 @@ def _read_folder(folder: Path, given: Mapping[str, _Size]) -> PoseSet:
         found.append((sheets[0].name, lambda: _read_xml(sheets[0])))
     if tables := [path for path in sorted(folder.glob("*.csv")) if is_realitycapture(_first_bytes(path))]:
         found.append((tables[0].name, lambda: read_realitycapture(tables[0], given)))
-    if phone := find_polycam(folder):
-        found.append(("Polycam's cameras", lambda: read_polycam(phone)))
+    if phone := _find_polycam(folder):
+        found.append(("Polycam's cameras", lambda: _read_polycam(phone)))
     if not found:
         raise CaptureError(f"{folder} holds no poses that we know; expected {_KNOWN}")
     (name, read), *others = found
@@ -228,7 +227,13 @@ def read_transforms(contents: Mapping[Path, Any], sizes: Mapping[str, _Size]) ->
             position = placement.to_source(matrix[:, 3])
             matrix = np.column_stack([placement.rotation.T @ matrix[:, :3], position])
             cameras.append((name, PosedCamera(matrix, lens, tuple(others))))
-        points = points or _read_points(path, transforms.scene, placement, noted)
+        name = transforms.scene.get("ply_file_path")
+        if points is None and isinstance(name, str):
+            try:
+                positions, colours = read_ply_points(find_named(path.parent, name) or path.parent / name)
+                points = placement.to_source(positions), colours
+            except (OSError, ValueError) as error:
+                noted.append(f"the sparse points of {name} can't be read ({error}); left out")
         up = placement.rotation.T @ np.array([0.0, 0.0, 1.0])
         warnings += [f"{path.name}: {text}" for text in dict.fromkeys(warned)]
         notes += [f"{path.name}: {text}" for text in dict.fromkeys(noted)]
@@ -384,15 +389,49 @@ def _read_matrix(value: Any, where: str) -> Float64[np.ndarray, "3 4"]:
     return matrix[:3]
 
 
-def _read_points(
-    path: Path, content: dict[str, Any], placement: Placement, notes: list[str]
-) -> SparsePoints | None:
-    name = content.get("ply_file_path")
-    if not isinstance(name, str):
-        return None
-    try:
-        positions, colours = read_ply_points(find_named(path.parent, name) or path.parent / name)
-    except (OSError, ValueError) as error:
-        notes.append(f"the sparse points of {name} can't be read ({error}); left out")
-        return None
-    return placement.to_source(positions), colours
+# Polycam's raw data: keyframes/cameras/NUMBER.json, one for each of keyframes/images/NUMBER.jpg. `t_00` to `t_23` are
+# the rows of camera to world, with OpenGL's axes of the camera and +y of the world up; `fx`, `fy`, `cx`, `cy`, `width`,
+# `height` in pixels. Cameras that Polycam optimised stand in corrected_cameras.
+# Sources: Polycam, raw data; nerfstudio, process_data/polycam_utils.py.
+
+_CORRECTED, _RAW = "corrected_cameras", "cameras"
+_MATRIX = [f"t_{row}{column}" for row in range(3) for column in range(4)]
+
+
+def _is_polycam(content: Any) -> bool:
+    """Whether JSON is a camera of Polycam's."""
+    return isinstance(content, dict) and all(key in content for key in (*_MATRIX, "fx"))
+
+
+def _find_polycam(folder: Path) -> list[Path]:
+    """Cameras in a folder of raw data, its keyframes/, or one of these folders itself; corrected ones if there are."""
+    for place in (folder / "keyframes", folder):
+        for name in (_CORRECTED, _RAW):
+            if found := sorted((place / name).glob("*.json")):
+                return found
+    return sorted(folder.glob("*.json")) if folder.name in (_CORRECTED, _RAW) else []
+
+
+def _read_polycam(paths: list[Path]) -> PoseSet:
+    """Poses of camera files. Raises CaptureError: one is damaged or none of Polycam's."""
+    folder = paths[0].parent
+    allow_parts(folder, len(paths), "cameras", CaptureError, 1 << 16)
+    cameras = []
+    for path in paths:
+        content = load_json(path)
+        if not _is_polycam(content):
+            raise CaptureError(f"{path} is no camera of Polycam's: it lacks 't_00' to 't_23' or 'fx'")
+        keys = [*_MATRIX, "fx", "fy", "cx", "cy", "width", "height"]
+        numbers = {key: read_number(content.get(key)) for key in keys}
+        if missing := [key for key, value in numbers.items() if value is None]:
+            raise CaptureError(f"{path}: {', '.join(missing)} should be numbers")
+        values = {key: float(value or 0.0) for key, value in numbers.items()}
+        if not (min(values["fx"], values["fy"]) > 0 and 1 <= min(values["width"], values["height"]) <= 1e6):
+            raise CaptureError(f"{path}: fx, fy, width or height are not above 0")
+        size = round(values["width"]), round(values["height"])
+        lens = Lens(*size, (values["fx"], values["fy"]), (values["cx"], values["cy"]))
+        pose = np.array([values[key] for key in _MATRIX]).reshape(3, 4)
+        cameras.append((path.stem, PosedCamera(pose, lens)))
+    up = np.array([0.0, 1.0, 0.0])
+    note = "those that Polycam optimised" if folder.name == _CORRECTED else "as the phone tracked them"
+    return make_pose_set(cameras, f"Polycam's {folder.name}", str(folder), None, up, [f"cameras are {note}"])

@@ -13,7 +13,6 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64
 
 from unmix_plugin.captures.names import path_text, size_of_view
 from unmix_plugin.captures.poses.lens import Lens
@@ -65,11 +64,24 @@ def read_realitycapture(path: Path, sizes: Mapping[str, tuple[int, int]]) -> Pos
         without += [] if size else [name]
         lens = None if size is None else _lens(row, size, dialect, where)
         position = np.array([x, y, height])
+        # Rz Rx Ry of angles in degrees.
+        angles = np.radians([-heading, pitch, roll])
+        (cz, cx, cy), (sz, sx, sy) = np.cos(angles), np.sin(angles)
+        about_z = np.array([[cz, -sz, 0.0], [sz, cz, 0.0], [0.0, 0.0, 1.0]])
+        about_x = np.array([[1.0, 0.0, 0.0], [0.0, cx, -sx], [0.0, sx, cx]])
+        about_y = np.array([[cy, 0.0, sy], [0.0, 1.0, 0.0], [-sy, 0.0, cy]])
         positions.append(position)
-        cameras.append(
-            (name, PosedCamera(np.column_stack([_rotation(-heading, pitch, roll), position]), lens))
+        rotation = about_z @ about_x @ about_y
+        cameras.append((name, PosedCamera(np.column_stack([rotation, position]), lens)))
+    # Longitudes and latitudes would squeeze the scene flat.
+    places = np.array(positions)
+    across, up_and_down = np.ptp(places[:, :2], axis=0).max(), np.ptp(places[:, 2])
+    is_on_earth = (np.abs(places[:, :2]) <= (180.0, 90.0)).all()
+    if is_on_earth and 0 < across < _LARGEST_DEGREES_SPREAD and up_and_down > _STEEPEST * across:
+        raise CaptureError(
+            f"{path}: x and y spread over {across:.2g}, and heights over {up_and_down:.3g}: they look like degrees; "
+            "export in a coordinate system in metres"
         )
-    _refuse_degrees(np.array(positions), path)
     notes = [f"the size of {name_some(without)} is not known: without a lens"] if without else []
     up = np.array([0.0, 0.0, 1.0])
     return make_pose_set(cameras, f"RealityCapture's {path.name}", str(path), None, up, notes)
@@ -80,18 +92,6 @@ def _number(row: Mapping[str, str], key: str, dialect: Dialect, where: str) -> f
     if value is None or not np.isfinite(value):
         raise CaptureError(f"{where}: {key} is {row.get(key, '')!r}; expected a number")
     return value
-
-
-def _rotation(yaw: float, pitch: float, roll: float) -> Float64[np.ndarray, "3 3"]:
-    """Rz Rx Ry of angles in degrees."""
-    (cz, cx, cy), (sz, sx, sy) = (
-        np.cos(np.radians([yaw, pitch, roll])),
-        np.sin(np.radians([yaw, pitch, roll])),
-    )
-    about_z = np.array([[cz, -sz, 0.0], [sz, cz, 0.0], [0.0, 0.0, 1.0]])
-    about_x = np.array([[1.0, 0.0, 0.0], [0.0, cx, -sx], [0.0, sx, cx]])
-    about_y = np.array([[cy, 0.0, sy], [0.0, 1.0, 0.0], [-sy, 0.0, cy]])
-    return about_z @ about_x @ about_y
 
 
 def _lens(row: Mapping[str, str], size: tuple[int, int], dialect: Dialect, where: str) -> Lens:
@@ -105,14 +105,3 @@ def _lens(row: Mapping[str, str], size: tuple[int, int], dialect: Dialect, where
     )
     center = (width / 2 + x * per_mm, height / 2 + y * per_mm)
     return Lens(width, height, (focal, focal), center, (k1, k2, t1, t2), (k3, k4))
-
-
-def _refuse_degrees(positions: Float64[np.ndarray, "N 3"], path: Path) -> None:
-    """Refuse longitudes and latitudes, which would squeeze the scene flat."""
-    across, up = np.ptp(positions[:, :2], axis=0).max(), np.ptp(positions[:, 2])
-    is_on_earth = (np.abs(positions[:, :2]) <= (180.0, 90.0)).all()
-    if is_on_earth and 0 < across < _LARGEST_DEGREES_SPREAD and up > _STEEPEST * across:
-        raise CaptureError(
-            f"{path}: x and y spread over {across:.2g}, and heights over {up:.3g}: they look like degrees; export in a "
-            "coordinate system in metres"
-        )

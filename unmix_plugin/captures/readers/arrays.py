@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from unmix_plugin.captures.cube import (
-    BandTable,
     Cube,
     Linear,
     Meaning,
@@ -138,7 +137,14 @@ def image_of_arrays(path: Path, reader: str, arrays: Sequence[FoundArray], optio
     axes = choose_axes(shape, fixed, None if given is None else len(given), remarks)
     of_image = image_shape(shape, axes)
     allow_parts(path, of_image[2], "bands", CaptureError, MOST_BANDS)
-    bands = _without_windows(check_bands(stated, of_image[2], remarks), image)
+    bands = check_bands(stated, of_image[2], remarks)
+    # NEON's `Band_Window_1_Nanometers`, in which the air lets no light through.
+    nm, windows = (
+        bands.wavelengths_nm,
+        [_numbers(v) for k, v in image.all_attributes.items() if _WINDOW.fullmatch(k)],
+    )
+    if nm is not None:
+        bands = bands.marking(*((nm >= min(ends)) & (nm <= max(ends)) for ends in windows if ends))
     linear = _linear(path, image, of_image[2], remarks)
     remarks += _unread(path, image)
     applied = () if linear is None else linear.entries
@@ -168,15 +174,6 @@ def image_of_arrays(path: Path, reader: str, arrays: Sequence[FoundArray], optio
         exposure=exposure,
         dataset=image.name if len(arrays) > 1 else "",
         others={"axes": axes},
-    )
-
-
-def _without_windows(table: BandTable, image: FoundArray) -> BandTable:
-    """The table with bands marked as bad where the air lets no light through, by NEON's `Band_Window_1_Nanometers`."""
-    nm = table.wavelengths_nm
-    windows = [_numbers(value) for key, value in image.all_attributes.items() if _WINDOW.fullmatch(key)]
-    return table.marking(
-        *((nm >= min(ends)) & (nm <= max(ends)) for ends in windows if nm is not None and ends)
     )
 
 
@@ -343,7 +340,15 @@ def _lists_beside(arrays: Sequence[FoundArray], image: FoundArray) -> dict[str, 
         is_list &= prod(array.shape) * max(1, array.dtype.itemsize) <= MOST_TEXT_BYTES
         if array is image or name in known or not (lengths and is_list):
             continue
-        numbers = _texts(array) if is_text else _unpacked(array)
+        stored: Any = np.asarray(array.numbers.array())
+        if is_text:  # of letters, a row is a text
+            letters = stored.ndim == 2 and stored.dtype == "S1"
+            texts = [b"".join(row) for row in stored] if letters else stored.reshape(-1).tolist()
+            numbers = _numbers_in_text(_decoded(texts[0]) if len(texts) == 1 else texts)
+        else:  # as CF packs any variable
+            gain, offset = (_first_number(array.attributes, name) for name in ("scale_factor", "add_offset"))
+            stored = stored.reshape(-1) if gain is None else stored.reshape(-1) * gain
+            numbers = (stored if offset is None else stored + offset).tolist()
         if len(numbers) not in lengths:
             continue
         plain = plain_names(array.attributes)
@@ -357,24 +362,13 @@ def _lists_beside(arrays: Sequence[FoundArray], image: FoundArray) -> dict[str, 
     return beside
 
 
-def _texts(array: FoundArray) -> list[Any]:
-    """Texts of a list, or the items of a single one, as numbers where all are; of letters, a row is a text."""
-    stored = np.asarray(array.numbers.array())
-    letters = stored.ndim == 2 and stored.dtype == "S1"
-    texts = [b"".join(row) for row in stored] if letters else stored.reshape(-1).tolist()
-    return _numbers_in_text(_decoded(texts[0]) if len(texts) == 1 else texts)
-
-
-def _unpacked(array: FoundArray) -> list[Any]:
-    """Numbers of a list, as CF packs any variable."""
-    stored: Any = array.numbers.array().reshape(-1)
-    gain, offset = (_first_number(array.attributes, name) for name in ("scale_factor", "add_offset"))
-    stored = stored if gain is None else stored * gain
-    return (stored if offset is None else stored + offset).tolist()
-
-
 def _linear(path: Path, image: FoundArray, num_bands: int, remarks: list[Remark]) -> Linear | None:
-    """Gains and offsets among the attributes of an image, or those of its level of PRISMA."""
+    """Gains and offsets among the attributes of an image, or those of its level of PRISMA: radiances of levels 1 and
+    2B, reflectances of 2C and 2D.
+
+    Source: ASI, PRISMA Products Specification, chapters 5 and 7 (`ScaleFactor_Vnir`, `L2ScaleVnirMin`); Busetto and
+    Ranghetti, prismaread (of level 2B).
+    """
     found = {key: _numbers(value) for key, value in image.all_attributes.items()}
     plain = plain_names({key: numbers for key, numbers in found.items() if numbers})
     found = {
@@ -384,15 +378,8 @@ def _linear(path: Path, image: FoundArray, num_bands: int, remarks: list[Remark]
     if "scale_factor" in named:  # before the factor of reflectances
         found.pop(named.get("reflectance_scale_factor", ""), None)
     linear = state_linear(path, num_bands, found, where="attribute", format_of=Format.ARRAYS, remarks=remarks)
-    return linear or _prisma(path, image, num_bands)
-
-
-def _prisma(path: Path, image: FoundArray, num_bands: int) -> Linear | None:
-    """Those of a PRISMA file: radiances of levels 1 and 2B, reflectances of 2C and 2D.
-
-    Source: ASI, PRISMA Products Specification, chapters 5 and 7 (`ScaleFactor_Vnir`, `L2ScaleVnirMin`); Busetto and
-    Ranghetti, prismaread (of level 2B).
-    """
+    if linear is not None:
+        return linear
     part = next((part for part in ("Vnir", "Swir") if part.lower() in image.own_name), "")
     names = (f"L2Scale{part}Min", f"L2Scale{part}Max", f"ScaleFactor_{part}", f"Offset_{part}")
     low, high, factor, offset = (_first_number(image.all_attributes, name.lower()) for name in names)

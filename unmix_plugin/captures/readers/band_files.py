@@ -107,7 +107,20 @@ def stack_bands(parts: Sequence[Cube], path: Path) -> Cube:
     ]
     differ = len({(repr(part.no_data), part.valid_range) for part in without_zeros}) > 1
     of_all = [number for part in parts for number in part.no_data if number == 0 or not differ]
-
+    tables = [part.bands for part in parts]
+    centres = _joined([table.wavelengths_nm for table in tables])
+    is_partial = centres is None and any(table.wavelengths_nm is not None for table in tables)
+    marks = [
+        np.zeros(1, bool) if table.bad is None else table.bad for table in tables
+    ]  # unmarked ones are good
+    names = _joined([table.names for table in tables])
+    bands = BandTable(
+        centres,
+        "only some of the files give wavelengths" if is_partial else tables[0].source,
+        _joined([table.fwhm_nm for table in tables]),
+        np.concatenate(marks) if any(table.bad is not None for table in tables) else None,
+        None if names is None else tuple(names.tolist()),
+    )
     return replace(
         first,
         path=path,
@@ -115,7 +128,7 @@ def stack_bands(parts: Sequence[Cube], path: Path) -> Cube:
         dtype=np.result_type(*(part.dtype for part in parts)),
         numbers=None,
         parts=tuple(without_zeros),
-        bands=_table_of([part.bands for part in parts]),
+        bands=bands,
         linear=replace(stated[0], gains=gains, offsets=offsets) if stated else None,
         no_data=tuple(dict.fromkeys(of_all)),
         valid_range=None if differ else first.valid_range,
@@ -137,22 +150,6 @@ def stack_bands(parts: Sequence[Cube], path: Path) -> Cube:
 def _joined(columns: Sequence[Any]) -> np.ndarray | None:
     """One column of several; lacking where one is."""
     return None if any(column is None for column in columns) else np.concatenate(columns)
-
-
-def _table_of(tables: Sequence[BandTable]) -> BandTable:
-    """The table of all bands; a band that nobody marks is good."""
-    centres = _joined([table.wavelengths_nm for table in tables])
-    is_partial = centres is None and any(table.wavelengths_nm is not None for table in tables)
-    is_marked = any(table.bad is not None for table in tables)
-    marks = [np.zeros(1, bool) if table.bad is None else table.bad for table in tables]
-    names = _joined([table.names for table in tables])
-    return BandTable(
-        centres,
-        "only some of the files give wavelengths" if is_partial else tables[0].source,
-        _joined([table.fwhm_nm for table in tables]),
-        np.concatenate(marks) if is_marked else None,
-        None if names is None else tuple(names.tolist()),
-    )
 
 
 def _other_entries(parts: Sequence[Cube]) -> dict[str, Any]:

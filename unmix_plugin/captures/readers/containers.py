@@ -177,17 +177,12 @@ def open_hdf5(path: Path, options: ReadOptions) -> Cube:
             raise CaptureError(f"{path}: the numbers of {name} lie in other files; write them into this one")
         of_chunk = prod(image.chunks) if image.chunks else 0
         allow_decoded(path, max(image.size, of_chunk) * image.dtype.itemsize, CaptureError)
-        return _with_fill(opened, image)
-
-
-def _with_fill(opened: Cube, image: Any) -> Cube:
-    """The image with the number that its data set has where nothing was written, if chunks of it are lacking."""
-    if image.chunks:
-        grid = [-(-length // step) for length, step in zip(image.shape, image.chunks, strict=True)]
-        absent = prod(grid) - image.id.get_num_chunks()
-    else:
-        absent = int(image.id.get_storage_size() == 0)
-    fill = float(np.array(image.fillvalue).astype(opened.dtype))
+        if image.chunks:
+            grid = [-(-length // step) for length, step in zip(image.shape, image.chunks, strict=True)]
+            absent = prod(grid) - image.id.get_num_chunks()
+        else:
+            absent = int(image.id.get_storage_size() == 0)
+        fill = float(np.array(image.fillvalue).astype(opened.dtype))  # where nothing was written
     if not absent or fill in opened.no_data or not np.isfinite(fill):
         return opened
     taken = "in all bands " * (fill == 0) + "count as not measured"
@@ -214,12 +209,16 @@ def _found_in_hdf5(
     if not is_cube and (item.external or item.is_virtual):
         return []
 
-    names, fill = _axis_names(item), None
+    axes, fill = [], None  # named by NetCDF's dimension scales or by labels
+    for dimension in item.dims:
+        scales = [scale.name for scale in dimension.values()] if len(dimension) else []
+        axes.append((scales[0] or "") if scales else dimension.label)
     if dtype.kind in "iuf":
         # HDF5 ends the process where a damaged value is asked for; asked whether there is one, it raises an error.
         item.id.get_create_plist().fill_value_defined()
         fill = float(item.fillvalue)
     numbers = _hdf5_numbers(path, name, item, dtype, is_matlab, is_letters)
+    names = tuple(axes) if any(axes) else None
     return [FoundArray(name, shape, dtype, numbers, attributes, inherited, names, fill)]
 
 
@@ -267,15 +266,6 @@ def _read_chunks(path: Path, numbers: np.ndarray, axis: int, first: int, name: s
             of_file = [*within]
             of_file[axis] = slice(first + corner[axis], first + ends[axis])
             target[tuple(within)] = stored[tuple(of_file)]
-
-
-def _axis_names(item: Any) -> tuple[str, ...] | None:
-    """By NetCDF's dimension scales or by labels."""
-    names = []
-    for dimension in item.dims:
-        scales = [scale.name for scale in dimension.values()] if len(dimension) else []
-        names.append((scales[0] or "") if scales else dimension.label)
-    return tuple(names) if any(names) else None
 
 
 def _attributes(path: Path, item: Any) -> dict[str, Any]:
@@ -362,7 +352,15 @@ def _found_in_matlab(
     _, size, at, end = _tag(head, order, end)
     name = head[at : at + size].decode("utf-8", "replace")
     if class_number not in _CLASSES or flags & _IS_COMPLEX:
-        texts = _matlab_texts(head, order, end, shape) if class_number == _LETTERS else []
+        texts = []  # of each row of letters, unless they are too many for the first bytes
+        if class_number == _LETTERS:
+            kind, size, at, _ = _tag(head, order, end)
+            encoding = _ENCODINGS.get(kind, "latin-1")
+            encoding += {"<": "le", ">": "be"}[order] if encoding.endswith("-") else ""
+            letters = list(head[at : at + size].decode(encoding, "replace"))
+            if letters and len(letters) == prod(shape):
+                rows = np.array(letters).reshape(shape[0], -1, order="F")
+                texts = ["".join(row) for row in rows]
         found = np.array(texts) if texts else np.zeros((), UNREAD)
         return [FoundArray(name, found.shape, found.dtype, Held(found))] if name else []
     kind, size, at, _ = _tag(head, order, end)
@@ -376,17 +374,6 @@ def _found_in_matlab(
     allow_decoded(path, prod(shape) * max(stored.itemsize, dtype.itemsize), CaptureError, packed[1])
     numbers = Decoded(path, stored, shape, _unpack, (name, offset, packed), "F")
     return [FoundArray(name, shape, dtype, numbers)]
-
-
-def _matlab_texts(head: bytes, order: str, position: int, shape: tuple[int, ...]) -> list[str]:
-    """The text of each row of an array of letters; none where they are too many for its first bytes."""
-    kind, size, at, _ = _tag(head, order, position)
-    encoding = _ENCODINGS.get(kind, "latin-1")
-    encoding += {"<": "le", ">": "be"}[order] if encoding.endswith("-") else ""
-    letters = list(head[at : at + size].decode(encoding, "replace"))
-    if not letters or len(letters) != prod(shape):
-        return []
-    return ["".join(row) for row in np.array(letters).reshape(shape[0], -1, order="F")]
 
 
 def _tag(head: bytes, order: str, position: int) -> tuple[int, int, int, int]:

@@ -140,7 +140,17 @@ def mosaic_of(file: Cube) -> tuple[int, int] | None:
     values = values[:, left : left + _JUDGED_PX]
     if not np.isfinite(values).all():
         return None
-    shares = {filters: _share_of_places(values, *filters) for filters in _MOSAICS}
+    # How much of what pixels differ from the mean of their block their place in it explains.
+    shares = dict.fromkeys(_MOSAICS, 0.0)
+    for rows, columns in _MOSAICS:
+        high, wide = values.shape[0] // rows, values.shape[1] // columns
+        if min(high, wide) >= 2:
+            blocks = values[: high * rows, : wide * columns].reshape(high, rows, wide, columns)
+            means = blocks.mean(axis=(1, 3), keepdims=True)
+            apart = (blocks - means) / np.maximum(means, 1e-12)  # filters pass parts of the light
+            total = float((apart**2).mean())
+            if total > 0:
+                shares[rows, columns] = float((apart.mean(axis=(0, 2)) ** 2).mean()) / total
     best = max(shares.values())
     return next((filters for filters in _MOSAICS if shares[filters] >= max(_LEAST_SHARE, 0.9 * best)), None)
 
@@ -155,15 +165,3 @@ def said_of_mosaic(file: Cube) -> str:
         f". It looks like the raw frame of a mosaic camera, {rows} x {columns} filters: give --mosaic {rows}x{columns} "
         f"and the {rows * columns} wavelengths of its filters, row by row"
     )
-
-
-def _share_of_places(values: np.ndarray, rows: int, columns: int) -> float:
-    """How much of what pixels differ from the mean of their block their place in it explains."""
-    high, wide = values.shape[0] // rows, values.shape[1] // columns
-    if min(high, wide) < 2:
-        return 0.0
-    blocks = values[: high * rows, : wide * columns].reshape(high, rows, wide, columns)
-    means = blocks.mean(axis=(1, 3), keepdims=True)
-    apart = (blocks - means) / np.maximum(means, 1e-12)  # filters pass parts of the light
-    total = float((apart**2).mean())
-    return float((apart.mean(axis=(0, 2)) ** 2).mean()) / total if total > 0 else 0.0

@@ -20,7 +20,6 @@ from unmix_plugin.captures.report import Code, Remark
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.formats.envi import (
     MAP_KEYS,
-    EnviLayout,
     data_beside,
     header_begins,
     header_beside,
@@ -68,7 +67,22 @@ def open_envi(path: Path, _: ReadOptions) -> Cube:
     except ValueError as error:
         raise CaptureError(f"{header_path}: {error}") from error
     remarks = [Remark.of(Code.BYTE_ORDER_ASSUMED)] if layout.is_order_assumed else []
-    remarks += _check_size(header_path, data_path, layout)
+    found, needed = data_path.stat().st_size, layout.num_bytes
+    if found > needed:
+        remarks.append(Remark.of(Code.BYTES_LEFT, left=found - needed))
+    elif found < needed:
+        with data_path.open("rb") as file:
+            begin = file.read(6)
+        kind = next((kind for magic, kind in _COMPRESSED.items() if begin.startswith(magic)), None)
+        if kind is not None:
+            raise CaptureError(
+                f"{data_path}: compressed with {kind}; unpack it, as numbers are read in place"
+            )
+        height, width, num_bands = layout.shape
+        raise CaptureError(
+            f"{data_path}: cut short: {found} bytes; {header_path.name} promises {needed} ({height} lines x {width} "
+            f"samples x {num_bands} bands of {layout.dtype.name} after {layout.offset} bytes)"
+        )
     lengths = dict(zip("yxb", layout.shape, strict=True))
     stored = tuple(lengths[axis] for axis in layout.axes)
     numbers = Mapped(data_path, layout.dtype, stored, layout.offset)
@@ -154,6 +168,9 @@ def _described(file: Cube, header_path: Path, header: dict[str, str]) -> Cube:
     no_data = _numbers(header, "data ignore value", Code.NO_DATA_NO_NUMBER, remarks)
     if dark_lines:
         remarks.append(Remark.of(Code.DARK_LINES_APART, entry=_DARK_START))
+    # Source: headers of Specim's Lumo (fps) and of Resonon's Spectronon (framerate), both in Hz.
+    rate = next((key for key in _LINE_RATES if key in header), "")
+    rates = _numbers(header, rate, Code.LINE_RATE_NO_NUMBER, remarks)
     shown = {key: value for key, value in header.items() if len(value) < _SHOWN_LENGTH}
     on_map = {key: " ".join(header[key].split()) for key in MAP_KEYS if header.get(key)}
     return replace(
@@ -172,15 +189,8 @@ def _described(file: Cube, header_path: Path, header: dict[str, str]) -> Cube:
         reflectance_source="header field 'reflectance scale factor'" if _FACTOR in header else "",
         map_entries=on_map,
         others={**file.others, "header": shown},
-        lines_per_second=_line_rate(header, remarks),
+        lines_per_second=rates[0] if len(rates) == 1 and 0 < rates[0] < float("inf") else None,
     )
-
-
-def _line_rate(header: dict[str, str], remarks: list[Remark]) -> float | None:
-    """Lines a second. Source: headers of Specim's Lumo (fps) and of Resonon's Spectronon (framerate), both in Hz."""
-    key = next((key for key in _LINE_RATES if key in header), "")
-    stated = _numbers(header, key, Code.LINE_RATE_NO_NUMBER, remarks)
-    return stated[0] if len(stated) == 1 and 0 < stated[0] < float("inf") else None
 
 
 def _numbers(header: dict[str, str], key: str, otherwise: Code, remarks: list[Remark]) -> list[float]:
@@ -190,20 +200,3 @@ def _numbers(header: dict[str, str], key: str, otherwise: Code, remarks: list[Re
     except ValueError:
         remarks.append(Remark.of(otherwise, entry=key, value=header[key]))
         return []
-
-
-def _check_size(header_path: Path, data_path: Path, layout: EnviLayout) -> list[Remark]:
-    """A remark if there is more than the header describes; less, or compressed numbers, are refused."""
-    found, needed = data_path.stat().st_size, layout.num_bytes
-    if found >= needed:
-        return [Remark.of(Code.BYTES_LEFT, left=found - needed)] if found > needed else []
-    with data_path.open("rb") as file:
-        begin = file.read(6)
-    kind = next((kind for magic, kind in _COMPRESSED.items() if begin.startswith(magic)), None)
-    if kind is not None:
-        raise CaptureError(f"{data_path}: compressed with {kind}; unpack it, as numbers are read in place")
-    height, width, num_bands = layout.shape
-    raise CaptureError(
-        f"{data_path}: cut short: {found} bytes; {header_path.name} promises {needed} ({height} lines x {width} "
-        f"samples x {num_bands} bands of {layout.dtype.name} after {layout.offset} bytes)"
-    )

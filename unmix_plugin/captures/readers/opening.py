@@ -135,26 +135,20 @@ def _opened(path: Path, options: ReadOptions) -> Cube:
     opened = _READERS[kind](path, options)
     if kind == "folder":
         return opened
-    return _with_mask_beside(with_xml_beside(opened if kind == "envi" else described_by_header(opened)))
-
-
-def _with_mask_beside(file: Cube) -> Cube:
-    """The file with GDAL's mask NAME.msk, of one band or as many as the file, where there is one.
-
-    Source: GDAL, RFC 15: band masks.
-    """
-    height, width, num_bands = file.shape
-    for path in [path.with_name(f"{path.name}.msk") for path in file.files]:
-        if not path.is_file():
+    opened = with_xml_beside(opened if kind == "envi" else described_by_header(opened))
+    # GDAL's mask NAME.msk, of one band or as many as the file. Source: GDAL, RFC 15: band masks.
+    height, width, num_bands = opened.shape
+    for mask_path in [path.with_name(f"{path.name}.msk") for path in opened.files]:
+        if not mask_path.is_file():
             continue
-        mask = _READERS[_file_kind(path)](path, ReadOptions())
-        if mask.shape not in {(height + file.dark_lines, width, bands) for bands in (1, num_bands)}:
+        mask = _READERS[_file_kind(mask_path)](mask_path, ReadOptions())
+        if mask.shape not in {(height + opened.dark_lines, width, bands) for bands in (1, num_bands)}:
             size = " x ".join(map(str, mask.shape))
-            file = file.remarking(Remark.of(Code.MASK_OF_OTHER_SIZE, mask=path.name, size=size))
-            continue
-        if mask.numbers is not None:
-            file = with_mask(replace(file, sources=(*file.sources, path)), path.name, mask.numbers)
-    return file
+            opened = opened.remarking(Remark.of(Code.MASK_OF_OTHER_SIZE, mask=mask_path.name, size=size))
+        elif mask.numbers is not None:
+            opened = replace(opened, sources=(*opened.sources, mask_path))
+            opened = with_mask(opened, mask_path.name, mask.numbers)
+    return opened
 
 
 def _file_kind(path: Path) -> str:
@@ -206,6 +200,8 @@ def inspect_file(path: Path, options: ReadOptions | None = None) -> dict[str, An
     image is read, so that a file that is cut short is found out. Raises CaptureError: the file is neither, or is
     damaged.
     """
+    from unmix_plugin.captures.poses.reading import read_poses
+
     opened = refused = None
     try:
         opened = open_spectral_file(path, options)
@@ -237,21 +233,14 @@ def inspect_file(path: Path, options: ReadOptions | None = None) -> dict[str, An
             "metadata": _plain(opened.facts),
         }
     if opened is None or (path.suffix.lower() == ".npy" and opened.shape[1:] == (_LLFF_COLUMNS, 1)):
-        facts |= _poses_of(path, refused)
+        try:
+            poses = read_poses(path)
+            source = {"source": poses.source}
+            facts |= {"poses": len(poses.cameras), "notes": list(poses.notes), "metadata": source}
+        except CaptureError as error:
+            if refused is not None:  # neither an image nor poses: the more fitting reason
+                raise (error if path.suffix.lower() in _POSE_SUFFIXES else refused) from error
     return facts
-
-
-def _poses_of(path: Path, refused: CaptureError | None) -> dict[str, Any]:
-    """Number of cameras and notes of a file of poses; where it is not an image either, the more fitting reason."""
-    from unmix_plugin.captures.poses.reading import read_poses
-
-    try:
-        found = read_poses(path)
-    except CaptureError as error:
-        if refused is None:
-            return {}
-        raise (error if path.suffix.lower() in _POSE_SUFFIXES else refused) from error
-    return {"poses": len(found.cameras), "notes": list(found.notes), "metadata": {"source": found.source}}
 
 
 def _listed(values: np.ndarray | None) -> list[float] | None:

@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -175,8 +175,10 @@ def open_tiff(path: Path, options: ReadOptions) -> Cube:
         orientation=int(turned) if turned in range(1, 9) else 1,
         is_geotiff=on_map,
     )
-    for page in masks:
-        opened = _with_mask_page(opened, page)
+    for page in masks if shape[:2] == first.shaped[2:4] else ():  # otherwise rows or columns are pages
+        kind = np.dtype(page.dtype).newbyteorder(page.parent.byteorder)
+        mask = _Stack([page], (*shape[:2], 1), kind).numbers(path, "yxb")
+        opened = with_mask(opened, f"the mask in page {page.index}", mask)
     return opened
 
 
@@ -228,7 +230,11 @@ def _logged() -> Iterator[list[str]]:
 
 def _find_stack(path: Path, file: TiffFile, remarks: list[Remark]) -> _Stack:
     """The pages that hold the most bands, all alike; previews and masks are passed over."""
-    pages = _image_pages(file)
+    in_file: Any = file.pages
+    pages = list(in_file)  # before the series, which take pages for more of the first one
+    if file.is_ome and len(file.series) > 1 and len({series.shape for series in file.series}) == 1:
+        pages = [page for page in file.series[0].pages if page is not None]  # of several positions the first
+    pages = [page for page in _with_below(pages) if not (page.is_reduced or page.is_mask)]
     if not pages:
         raise CaptureError(f"{path}: no image in this TIFF; expected at least one page")
     groups: dict[Any, list[TiffPage]] = defaultdict(list)
@@ -295,16 +301,6 @@ def _with_fill(stack: _Stack, no_data: float | None, remarks: list[Remark]) -> _
     return replace(stack, fill=fill, no_data=(*stated, *more))
 
 
-def _image_pages(file: TiffFile) -> list[TiffPage]:
-    """Pages that are no previews or masks, with those that lie below a page (SubIFDs); of several positions or times of
-    an OME-TIFF those of the first."""
-    in_file: Any = file.pages
-    listed = list(in_file)  # before the series, which take pages for more of the first one
-    if file.is_ome and len(file.series) > 1 and len({series.shape for series in file.series}) == 1:
-        listed = [page for page in file.series[0].pages if page is not None]
-    return [page for page in _with_below(listed) if not (page.is_reduced or page.is_mask)]
-
-
 def _with_below(pages: Any) -> list[Any]:
     return [*pages, *(sub for page in pages for sub in (page.pages or ()))]
 
@@ -322,13 +318,6 @@ def _mask_pages(path: Path, file: TiffFile, image: TiffPage) -> list[TiffPage]:
         _check_page(path, page, path.stat().st_size)
     allow_decoded(path, sum(page.nbytes for page in masks), CaptureError)
     return masks
-
-
-def _with_mask_page(opened: Cube, page: TiffPage) -> Cube:
-    if opened.shape[:2] != page.shaped[2:4]:  # rows or columns are pages
-        return opened
-    stack = _Stack([page], (*opened.shape[:2], 1), np.dtype(page.dtype).newbyteorder(page.parent.byteorder))
-    return with_mask(opened, f"the mask in page {page.index}", stack.numbers(opened.path, "yxb"))
 
 
 def _check_page(path: Path, page: TiffPage, file_size: int) -> None:
@@ -386,23 +375,20 @@ def _decode_pages(
             strips = range(top // down * across, -(-(top + image.shape[1]) // down) * across)
             for plane in range(planes):
                 for strip in strips:
-                    _decode_strip(data, page, plane * per_plane + strip, image, top)
-
-
-def _decode_strip(data: BinaryIO, page: TiffPage, index: int, image: np.ndarray, first: int) -> None:
-    """Copy a strip or tile to its place in (planes, h, W, S), whose first row is `first` of the page."""
-    data.seek(page.dataoffsets[index])
-    stored = data.read(page.databytecounts[index])
-    if len(stored) < page.databytecounts[index]:
-        raise CaptureError(f"{data.name}: cut short in strip or tile {index}; copy the file again")
-    decoded: Any = page.decode(stored or None, index, jpegtables=page.jpegtables)
-    values, (plane, _, top, left, _), _ = decoded
-    if values is None:  # left out in the file
-        return
-    above = max(0, first - top)
-    place = image[plane, top + above - first :, left:]
-    part = values[0, above : above + place.shape[0], : place.shape[1]]
-    place[: part.shape[0], : part.shape[1]] = part
+                    index_of = plane * per_plane + strip
+                    data.seek(page.dataoffsets[index_of])
+                    stored = data.read(page.databytecounts[index_of])
+                    if len(stored) < page.databytecounts[index_of]:
+                        raise CaptureError(
+                            f"{path}: cut short in strip or tile {index_of}; copy the file again"
+                        )
+                    decoded: Any = page.decode(stored or None, index_of, jpegtables=page.jpegtables)
+                    values, (part_of, _, row, left, _), _ = decoded
+                    if values is not None:  # not left out in the file
+                        above = max(0, top - row)
+                        place = image[part_of, row + above - top :, left:]
+                        part = values[0, above : above + place.shape[0], : place.shape[1]]
+                        place[: part.shape[0], : part.shape[1]] = part
 
 
 def _text(page: TiffPage, tag: int) -> str:
