@@ -116,7 +116,14 @@ class Numbers:
         """A copy of some rows, and of bands in rising order; slices have both ends and no step."""
         block = self.blocks[0]
         if len(self.blocks) > 1:
-            part = self._part_of_blocks(rows, bands)
+            # Of the blocks that are asked for; within one, all bands are read, of which there are few.
+            of_axis = {"b": bands, "y": rows, "x": slice(None)}
+            chosen = np.arange(len(self.blocks))[of_axis[self.axes[0]]]
+            within = rows if self.axes[1] == "y" else slice(None)
+            planes = [self.blocks[index].array().reshape(self.shape[1:])[within] for index in chosen]
+            left_rows = rows if self.axes[2] == "y" else slice(None)
+            left_bands = slice(None) if self.axes[0] == "b" else bands
+            part = _take(np.stack(planes), self.axes, left_rows, left_bands)
         elif isinstance(block, Decoded) and block.shape == self.shape:
             pieces = block.pieces(self.axes.index("y"), rows.start, rows.stop)
             parts = [
@@ -127,16 +134,6 @@ class Numbers:
         else:
             part = _take(block.array().reshape(self.shape), self.axes, rows, bands)
         return part.astype(self.dtype.newbyteorder("="), copy=False)
-
-    def _part_of_blocks(self, rows: slice, bands: BandIndex) -> np.ndarray:
-        """Of the blocks that are asked for; within one, all bands are read, of which there are few."""
-        of_axis = {"b": bands, "y": rows, "x": slice(None)}
-        chosen = np.arange(len(self.blocks))[of_axis[self.axes[0]]]
-        is_by_row = self.axes[1] == "y"
-        planes = [self.blocks[index].array().reshape(self.shape[1:]) for index in chosen]
-        stack = np.stack([np.array(plane[rows] if is_by_row else plane) for plane in planes])
-        left_rows = rows if self.axes[2] == "y" else slice(None)
-        return _take(stack, self.axes, left_rows, slice(None) if self.axes[0] == "b" else bands)
 
 
 def _take(stored: np.ndarray, axes: str, rows: slice, bands: BandIndex) -> Shaped[np.ndarray, "h W b"]:
@@ -190,21 +187,16 @@ class _Scratch:
         if self._file is None:
             self._file = tempfile.TemporaryFile(prefix="unmix-", dir=folder)  # noqa: SIM115 (open until the end)
         try:
-            _take_disk(self._file, self._end, needed)
+            if hasattr(os, "posix_fallocate"):
+                os.posix_fallocate(self._file.fileno(), self._end, max(1, needed))
+            else:
+                self._file.seek(self._end)
+                for start in range(0, needed, 1 << 22):
+                    self._file.write(bytes(min(1 << 22, needed - start)))
+                self._file.flush()
         except OSError as error:
             raise CaptureError(f"{path}: can't be decoded in {folder}: {error.strerror or error}") from error
         return self._end
-
-
-def _take_disk(file: IO[bytes], at: int, needed: int) -> None:
-    """Bytes of 0 in a file, with their disk."""
-    if hasattr(os, "posix_fallocate"):
-        os.posix_fallocate(file.fileno(), at, max(1, needed))
-        return
-    file.seek(at)
-    for start in range(0, needed, 1 << 22):
-        file.write(bytes(min(1 << 22, needed - start)))
-    file.flush()
 
 
 _scratch = _Scratch()

@@ -333,7 +333,37 @@ def asked_distance(options: ProcessOptions, views: Sequence[CaptureView]) -> Kno
 def _metres_per_unit(known: KnownDistance, cameras: Mapping[str, PosedCamera]) -> tuple[float, Remark]:
     """Metres in a unit of the world that cameras with lenses stand in, and how sure that is. Raises ConfigError: a
     view has no pose, the pixels of a point are not those of one, or the points are the same."""
-    ends = np.stack([_triangulate(number, point, cameras) for number, point in enumerate(known[:2], 1)])
+    places = []
+    for number, point in enumerate(known[:2], 1):  # where the two rays of each point meet
+        where, seen, rays = f"{_FLAG}: point {number}, views {' and '.join(point)}", [], []
+        limit = _MOST_MISS_PX
+        for name, pixel in point.items():
+            if name not in cameras:
+                raise ConfigError(f"{where}: {name} has no pose; choose another view that shows the point")
+            camera = cameras[name]
+            pixels = None if camera.lens is None else camera.lens.from_file(np.array([pixel]))
+            ray = None if pixels is None else camera.rays_of(pixels)
+            if camera.lens is None or pixels is None or ray is None:
+                raise ConfigError(f"{where}: the lens of {name} can't be followed there; choose another view")
+            seen.append((camera, pixels))
+            rays.append(ray[0])
+            limit = max(limit, _MOST_MISS * math.hypot(camera.lens.width, camera.lens.height))
+        angle = math.degrees(math.asin(min(1.0, float(np.linalg.norm(np.cross(*rays))))))
+        if angle < _LEAST_MEETING_DEG:
+            raise ConfigError(
+                f"{where}: its rays are nearly parallel ({angle:.2f} degrees between them); expected "
+                f"{_LEAST_MEETING_DEG:g} or more: choose views that are farther apart"
+            )
+        meeting = where_rays_meet(seen)
+        assert meeting is not None  # both lenses were followed
+        miss = float(np.max(meeting[1]))
+        if not miss <= limit:
+            far = "meet behind a camera" if math.isnan(miss) else f"miss each other by {miss:.1f} px"
+            raise ConfigError(
+                f"{where}: its rays {far}; expected at most {limit:.1f} px: is it one point, and do the poses fit?"
+            )
+        places.append(meeting[0][0])
+    ends = np.stack(places)
     shown = [cameras[name].pixels_of(ends) for point in known[:2] for name in point]
     apart = float(np.nanmax([np.linalg.norm(pixels[1] - pixels[0]) for pixels in shown]))
     if not apart > _LEAST_APART_PX:
@@ -344,36 +374,3 @@ def _metres_per_unit(known: KnownDistance, cameras: Mapping[str, PosedCamera]) -
     facts = {"metres": f"{known[2]:g}", "pixels": f"{apart:.0f}", "share": f"{1 / apart:.1%}"}
     remark = Remark.of(Code.SCALE_BY_DISTANCE, **facts)
     return known[2] / float(np.linalg.norm(ends[1] - ends[0])), remark
-
-
-def _triangulate(number: int, point: _Seen, cameras: Mapping[str, PosedCamera]) -> Float64[np.ndarray, "3"]:
-    """Where the two rays of a point meet."""
-    where, seen, rays = f"{_FLAG}: point {number}, views {' and '.join(point)}", [], []
-    limit = _MOST_MISS_PX
-    for name, pixel in point.items():
-        if name not in cameras:
-            raise ConfigError(f"{where}: {name} has no pose; choose another view that shows the point")
-        camera = cameras[name]
-        pixels = None if camera.lens is None else camera.lens.from_file(np.array([pixel]))
-        ray = None if pixels is None else camera.rays_of(pixels)
-        if camera.lens is None or pixels is None or ray is None:
-            raise ConfigError(f"{where}: the lens of {name} can't be followed there; choose another view")
-        seen.append((camera, pixels))
-        rays.append(ray[0])
-        limit = max(limit, _MOST_MISS * math.hypot(camera.lens.width, camera.lens.height))
-    angle = math.degrees(math.asin(min(1.0, float(np.linalg.norm(np.cross(*rays))))))
-    if angle < _LEAST_MEETING_DEG:
-        raise ConfigError(
-            f"{where}: its rays are nearly parallel ({angle:.2f} degrees between them); expected "
-            f"{_LEAST_MEETING_DEG:g} or more: choose views that are farther apart"
-        )
-    meeting = where_rays_meet(seen)
-    assert meeting is not None  # both lenses were followed
-    places, misses = meeting
-    miss = float(np.max(misses))
-    if not miss <= limit:
-        far = "meet behind a camera" if math.isnan(miss) else f"miss each other by {miss:.1f} px"
-        raise ConfigError(
-            f"{where}: its rays {far}; expected at most {limit:.1f} px: is it one point, and do the poses fit?"
-        )
-    return places[0]

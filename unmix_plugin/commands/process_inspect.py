@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -56,14 +55,24 @@ class _InspectOptions(ReadingOptions):
 def inspect_command(arguments: list[str]) -> int:
     """Parse the arguments and print what each file holds; the exit status is 0, or 2 if a file was refused."""
     options = tyro.cli(_InspectOptions, prog="unmix-process inspect", args=arguments)
+    from rich.table import Table
+    from rich.text import Text
+
+    from unmix_plugin.commands.reporting import CommandConsole
+
     if not options.files:
         raise ConfigError("no file is named; expected unmix-process inspect FILE...")
+    console = CommandConsole()
     reports = [_report(path, options.for_readers()) for path in options.files]
-    if options.json:
-        for report in reports:
+    for report in reports:
+        if options.json:
             tell(json.dumps(report))
-    else:
-        _print_tables(reports)
+            continue
+        title = Text(report["file"], style="bold")
+        table = Table(title=title, title_justify="left", show_header=False, box=None)
+        for name, text in _rows(report):
+            table.add_row(name, Text(text))
+        console.print(table, markup=False, highlight=False)
     return USER_ERROR if any("error" in report for report in reports) else DONE
 
 
@@ -72,23 +81,8 @@ def _report(path: Path, options: ReadOptions) -> dict[str, Any]:
 
     try:
         return inspect_file(path, options)
-    except CaptureError as error:
+    except CaptureError as error:  # of this file alone
         return {"file": str(path), "error": str(error)}
-
-
-def _print_tables(reports: Sequence[dict[str, Any]]) -> None:
-    from rich.table import Table
-    from rich.text import Text
-
-    from unmix_plugin.commands.reporting import CommandConsole
-
-    console = CommandConsole()
-    for report in reports:
-        title = Text(report["file"], style="bold")
-        table = Table(title=title, title_justify="left", show_header=False, box=None)
-        for name, text in _rows(report):
-            table.add_row(name, Text(text))
-        console.print(table, markup=False, highlight=False)
 
 
 def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:

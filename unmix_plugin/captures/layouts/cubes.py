@@ -86,7 +86,16 @@ def find_cubes(root: Path, options: ReadOptions) -> Capture:
     cubes = _cubes_among(files)
     if any(not _is_reference(path, ()) for path in cubes):
         return _capture_of_groups(root, {root: cubes}, options)
-    folders = _band_folders(root, excluded)
+    # Folders that hold more than one file of a band, and no cube, are views.
+    inside = [path for path in root.iterdir() if path.is_dir() and not path.name.startswith(".")]
+    inside = [
+        path for path in inside if path.name.lower() not in MASK_FOLDERS and path.resolve() not in excluded
+    ]
+    folders = []
+    for path in sorted(path for path in inside if not _is_reference(path, ())):
+        suffixes = [file.suffix.lower() for file in _visible_files(path)]
+        is_view = sum(suffix in _BAND_SUFFIXES for suffix in suffixes) > 1
+        folders += [path] if is_view and not _CUBE_SUFFIXES - _BAND_SUFFIXES & {*suffixes} else []
     if not folders and (deeper := _cubes_below(root, excluded)):  # references may lie in the folder itself
         return _capture_of_groups(root, deeper, options)
     pictures = [*plain.values()]
@@ -318,20 +327,6 @@ def _same_name(first: Path, second: Path) -> str:
 
 def _visible_files(folder: Path) -> list[Path]:
     return sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
-
-
-def _band_folders(root: Path, excluded: set[Path]) -> list[Path]:
-    """Folders that hold more than one file of a band, and no cube, each a view."""
-    folders = [path for path in root.iterdir() if path.is_dir() and not path.name.startswith(".")]
-    folders = [path for path in folders if path.name.lower() not in MASK_FOLDERS]
-    folders = [path for path in folders if path.resolve() not in excluded and not _is_reference(path, ())]
-    suffixes = [[file.suffix.lower() for file in _visible_files(path)] for path in folders]
-    return sorted(
-        path
-        for path, held in zip(folders, suffixes, strict=True)
-        if sum(suffix in _BAND_SUFFIXES for suffix in held) > 1
-        and not _CUBE_SUFFIXES - _BAND_SUFFIXES & set(held)
-    )
 
 
 def _name(path: Path) -> str:

@@ -94,27 +94,16 @@ def _candidates(view: CaptureView, root: Path) -> list[tuple[Path, str]]:
         marked = [f"{stem}{mark}{suffix}" for stem in stems for mark in _MARKS for suffix in _SUFFIXES]
         marked += [f"mask_{stem}{suffix}" for stem in stems for suffix in _SUFFIXES]
         inside = [f"{stem}{suffix}" for stem in stems for suffix in _SUFFIXES]
-        found += [
-            (folder, name) for folder in _mask_folders(image.parent, root) for name in [*inside, *marked]
-        ]
+        # masks/ in and beside the folder of the image and those above it, with the folders that lie between.
+        tops = [image.parent]
+        while tops[-1] != root and root in tops[-1].parents:
+            tops.append(tops[-1].parent)
+        for top in [*tops, tops[-1].parent]:
+            between = image.parent.relative_to(top).parts
+            places = [
+                top.joinpath(name, *inner) for name in MASK_FOLDERS for inner in (between[1:], between, ())
+            ]
+            found += [(place, name) for place in dict.fromkeys(places) for name in [*inside, *marked]]
         beside = [f"{image.name}{suffix}" for suffix in _SUFFIXES]
         found += [(image.parent, name) for name in [*beside, *marked]]
     return [*dict.fromkeys(found)]
-
-
-def _mask_folders(folder: Path, root: Path) -> list[Path]:
-    """masks/ in and beside the folder of an image and those above it, with the folders that lie between."""
-    tops = [folder]
-    while tops[-1] != root and root in tops[-1].parents:
-        tops.append(tops[-1].parent)
-    tops.append(tops[-1].parent)
-    between = [folder.relative_to(top) for top in tops]
-    below = [path.parts[1:] for path in between]
-    return [
-        *dict.fromkeys(
-            top.joinpath(name, *inner)
-            for top, whole, inner_parts in zip(tops, between, below, strict=True)
-            for name in MASK_FOLDERS
-            for inner in (inner_parts, whole.parts, ())
-        )
-    ]

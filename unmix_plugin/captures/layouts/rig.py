@@ -92,7 +92,14 @@ def find_rig(root: Path, options: ReadOptions) -> Capture:
         views.append(CaptureView(name, item.file, sensor, lens=lens, shot=shot, split=splits[shot]))
     _check_lenses(views)
     notes += [f"lens {sensor}: {why} ({counted(n, 'file')})" for (sensor, why), n in missing.items()]
-    views = _with_given_bands(views, options)
+    if (given := options.wavelengths_nm) is not None:  # of a user, one a lens in the order of their names
+        lenses = sorted({view.sensor for view in views})
+        if len(given) != len(lenses):
+            named = f"{len(lenses)} lenses ({', '.join(lenses)})"
+            raise CaptureError(f"--wavelengths gives {len(given)} numbers for {named}; expected one a lens")
+        source = "given with --wavelengths"
+        tables = {one: BandTable(np.array([nm]), source) for one, nm in zip(lenses, given, strict=True)}
+        views = [replace(view, cube=replace(view.cube, bands=tables[view.sensor])) for view in views]
     ordered = sorted(views, key=lambda view: natural_order(view.name))
     return Capture("rig", root, tuple(ordered), notes=tuple(notes))
 
@@ -126,20 +133,6 @@ def _check_lenses(views: Sequence[CaptureView]) -> None:
                     f"{view.cube.path} has {found} {what}, {same.cube.path} of the same lens {view.sensor} {expected}: "
                     "process different flights apart"
                 )
-
-
-def _with_given_bands(views: list[CaptureView], options: ReadOptions) -> list[CaptureView]:
-    """Wavelengths of a user, one a lens in the order of their names."""
-    given = options.wavelengths_nm
-    if given is None:
-        return views
-    sensors = sorted({view.sensor for view in views})
-    if len(given) != len(sensors):
-        lenses = f"{len(sensors)} lenses ({', '.join(sensors)})"
-        raise CaptureError(f"--wavelengths gives {len(given)} numbers for {lenses}; expected one a lens")
-    source = "given with --wavelengths"
-    tables = {sensor: BandTable(np.array([nm]), source) for sensor, nm in zip(sensors, given, strict=True)}
-    return [replace(view, cube=replace(view.cube, bands=tables[view.sensor])) for view in views]
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
@@ -231,23 +232,16 @@ def _text_images(path: Path) -> list[_Image]:
     was; other programs leave blank ones out. So such lines are told by their form."""
 
     def parse(line: str) -> _Image | None:
-        if _is_observations(line):
-            return None
+        words = line.split()
+        with suppress(ValueError):  # x, y and the number of a point, again and again
+            _ = [float(word) for word in words], [int(word) for word in words[2::3]]
+            if len(words) % 3 == 0:
+                return None
         _, *numbers = line.split(maxsplit=9)
         return numbers[8].strip(), int(numbers[7]), tuple(map(float, numbers[:7]))
 
     found = _parsed(path, parse, "number, quaternion, translation, camera and name")
     return [image for image in found if image is not None]
-
-
-def _is_observations(line: str) -> bool:
-    """Whether a line lists points that an image saw: x, y and the number of the point, again and again."""
-    words = line.split()
-    try:
-        _ = [float(word) for word in words], [int(word) for word in words[2::3]]
-    except ValueError:
-        return False
-    return len(words) % 3 == 0
 
 
 def _text_points(path: Path) -> SparsePoints:

@@ -446,10 +446,23 @@ def _measured_numbers(
 ) -> tuple[np.dtype, tuple[float, ...], tuple[float, float] | None]:
     """Type of the stored numbers, every one that stands for no measurement, and the range of those that do.
 
-    Source: CF conventions, 2.5.1: `_FillValue` and `missing_value` both mark missing numbers.
+    Source: CF conventions, 2.5.1: `_FillValue` and `missing_value` both mark missing numbers; of ranges netCDF-Java,
+    EnhanceScaleMissingUnsigned.
     """
-    attributes, dtype, valid = image.all_attributes, image.dtype, _valid_range(image, linear)
+    attributes, dtype, valid = image.all_attributes, image.dtype, None
     named = plain_names(attributes)
+    stated = {name: attributes[named[name]] for name in _VALID if name in named}
+    ends = {name: _numbers(value) for name, value in stated.items()}
+    both = [*ends.get("valid_min", [-np.inf]), *ends.get("valid_max", [np.inf])]
+    both = ends["valid_range"] if len(ends.get("valid_range", [])) == 2 else both
+    if stated and len(both) == 2:
+        is_float = any(np.asarray(value).dtype.kind == "f" for value in stated.values())
+        if (
+            is_float and dtype.kind != "f" and linear is not None
+        ):  # one of values, beside packed whole numbers
+            packed = np.subtract.outer(both, linear.offsets) / linear.gains
+            both = [packed[0].min() - 0.5, packed[1].max() + 0.5]  # between whole numbers, as dividing rounds
+        valid = float(both[0]), float(both[1])
     no_data = [number for name in _NO_DATA if name in named for number in _numbers(attributes[named[name]])]
     if dtype.kind == "i" and str(attributes.get("_Unsigned", "")).lower() == "true":
         dtype, more = np.dtype(dtype.str.replace("i", "u")), 256.0**dtype.itemsize  # attributes are signed
@@ -459,23 +472,3 @@ def _measured_numbers(
         no_data.append(image.fill)  # other numbers may be light
     no_data = [np.nan if np.isnan(number) else number for number in no_data]  # of which one is like another
     return dtype, tuple(dict.fromkeys(no_data)), valid
-
-
-def _valid_range(image: FoundArray, linear: Linear | None) -> tuple[float, float] | None:
-    """Least and greatest stored number that was measured, by NetCDF's attributes.
-
-    A range of floating-point numbers beside packed whole ones is one of values. Source: netCDF-Java,
-    EnhanceScaleMissingUnsigned.
-    """
-    keys, attributes = plain_names(image.all_attributes), image.all_attributes
-    stated = {name: attributes[keys[name]] for name in _VALID if name in keys}
-    numbers = {name: _numbers(value) for name, value in stated.items()}
-    low, high = numbers.get("valid_min", [-np.inf]), numbers.get("valid_max", [np.inf])
-    both = numbers["valid_range"] if len(numbers.get("valid_range", [])) == 2 else [*low, *high]
-    if not stated or len(both) != 2:
-        return None
-    is_float = any(np.asarray(value).dtype.kind == "f" for value in stated.values())
-    if is_float and image.dtype.kind != "f" and linear is not None:
-        ends = np.subtract.outer(both, linear.offsets) / linear.gains
-        both = [ends[0].min() - 0.5, ends[1].max() + 0.5]  # between whole numbers, as dividing rounds
-    return float(both[0]), float(both[1])
