@@ -36,10 +36,12 @@ class ChangeFiles:
     max_views: int = MOST_VIEWS
     follow: Follow = field(default=lambda _doing, items: items)
 
-    def views(self, comparison: Comparison) -> list[RunView]:
-        """The views of the first capture that are shown: evaluation views, or training views where there are none."""
+    def __post_init__(self) -> None:
         if self.max_views < 1:
             raise ConfigError(f"--max-views is {self.max_views}; choose at least 1")
+
+    def views(self, comparison: Comparison) -> list[RunView]:
+        """The views of the first capture that are shown: evaluation views, or training views where there are none."""
         views = comparison.before.scene.views
         offered = views_of(views, "eval") or views_of(views, "train")
         return [offered[index] for index in evenly_spaced(len(offered), self.max_views)]
