@@ -19,7 +19,8 @@ from unmix_plugin.poses.training import CorrectedRays
 from unmix_plugin.rendering.renderer import RenderedRays
 from unmix_plugin.sensors.views import from_batch
 from unmix_plugin.settings import RendererConfig, UnmixFieldConfig, UnmixModelConfig
-from unmix_plugin.spectral.materials import Coefficients
+from unmix_plugin.spectral.intervals import Interval
+from unmix_plugin.spectral.materials import Coefficients, Materials
 from unmix_plugin.trained.open_run import unmix_scene
 from unmix_plugin.trained.trained_scene import TrainedScene
 
@@ -35,6 +36,12 @@ CONFIG = UnmixModelConfig(
     ),
     renderer=RendererConfig(samples_per_pixel=1.0, smallest_weight=0.0),
 )
+
+
+def around_endmembers(materials: Materials) -> Interval:
+    """90 % intervals of endmembers, 0.05 to both sides."""
+    spectra = materials.endmembers.double().numpy()
+    return Interval((spectra - 0.05).clip(min=0), spectra + 0.05, 0.9)
 
 
 def make_model(

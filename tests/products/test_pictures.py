@@ -9,6 +9,7 @@ import torch
 from PIL import Image
 from torch.testing import assert_close
 
+from tests.factories.models import around_endmembers
 from unmix_plugin.figures.look import NEUTRAL
 from unmix_plugin.figures.paint import ColourScale
 from unmix_plugin.figures.pictures import TitledPicture, draw_panels, in_rows
@@ -64,7 +65,7 @@ def test_no_figure_is_cut_off_however_many_materials(count, tmp_path):
     view = rendered(given)
     assert_has_white_margins(draw_abundances("view", view, given))
     assert_has_white_margins(draw_segmentation("view", view, given))
-    _write_endmembers(tmp_path, given)
+    _write_endmembers(tmp_path, given, around_endmembers(given))
     plot = decoded((tmp_path / "endmembers.png").read_bytes())
     assert plot[:, -2:].min() == 1.0
     assert plot.min() < 0.2

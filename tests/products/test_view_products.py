@@ -18,7 +18,7 @@ from torch.testing import assert_close
 
 from tests.factories import scenes
 from tests.factories.cameras import FRAME, around
-from tests.factories.models import make_scene
+from tests.factories.models import around_endmembers, make_scene
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import KeyPoses
 from unmix_plugin.engine.processes import ALONE
@@ -45,7 +45,7 @@ def job_of(scene, folder, say=lambda _: None):
 
 
 def test_spectral_python_opens_the_endmembers_as_a_library(tmp_path):
-    _write_endmembers(tmp_path, MATERIALS)
+    _write_endmembers(tmp_path, MATERIALS, around_endmembers(MATERIALS))
     assert sorted(tmp_path.glob("[!.]*")) == sorted(_endmember_paths(tmp_path))
     library: Any = envi.open(str(tmp_path / "endmembers.hdr"), str(tmp_path / "endmembers.sli"))
     assert library.names == list(MATERIALS.names)
