@@ -53,7 +53,8 @@ def test_the_object_of_a_run_is_a_folder_that_neumatex_reads(ball):
     found = load_object(folder)
     mesh = trimesh.load_mesh(folder / "mesh.ply")
     assert len(mesh.faces) <= 500
-    assert mesh.is_watertight
+    _, triangles = np.unique(mesh.edges_sorted, axis=0, return_counts=True)
+    assert set(triangles % 2) == {0}  # no edge of a hole; where parts touch, an edge may have four triangles
     assert np.linalg.norm(mesh.vertices.mean(axis=0) - CENTRE) < 0.2
     assert abs(np.linalg.norm(mesh.vertices - CENTRE, axis=1).mean() - RADIUS) < 0.1
     assert found.bands is not None

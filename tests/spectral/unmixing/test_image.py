@@ -23,7 +23,6 @@ def image_of(materials, size=40, seed=0, noise=0.002):
     return pixels.clamp(min=0).numpy().reshape(size, size, -1)
 
 
-@pytest.mark.usefixtures("few_searches")
 def test_materials_and_their_shares_are_found_in_whole_numbers_of_any_unit():
     materials = smooth_endmembers(3)
     cube = image_of(materials)
