@@ -151,7 +151,7 @@ def open_regular(path: Path) -> BinaryIO:
 def read_bounded(path: Path, most: int = MOST_TEXT_BYTES) -> bytes:
     """All bytes of a regular file that is read whole. Raises OSError: it can't be read, is no regular file, or has more
     than `most` bytes."""
-    with open_regular(path) as file:
+    with open(path, "rb", opener=regular_file) as file:
         size = os.fstat(file.fileno()).st_size
         data = b"" if size > most else file.read(most + 1)
     if size > most or len(data) > most:
@@ -159,21 +159,44 @@ def read_bounded(path: Path, most: int = MOST_TEXT_BYTES) -> bytes:
     return data
 
 
-def parse_json(text: str) -> Any:
-    """The value in a text of JSON.
+class UnreadableJsonError(ValueError):
+    """A file holds no JSON; the text says why, and follows the file's name."""
 
-    Raises:
-        ValueError: it is none, gives a key twice with different values, of which nobody knows the right one, or has so
-            many values that they would take far more memory than the text.
-        RecursionError: values lie too deep in one another.
-    """
+
+def read_json(path: Path) -> Any:
+    """The value in a JSON file. Raises UnreadableJsonError: it is not in UTF-8 or UTF-16, not JSON, nested too deeply,
+    or has text that is not Unicode. Raises OSError: it can't be read, or is too long."""
+    data = read_bounded(path, MOST_TABLE_BYTES)
+    if not data.strip(b"\xef\xbb\xbf\t\r\n "):
+        raise UnreadableJsonError("is empty; expected JSON")
+    try:
+        is_utf16 = data[:2] in (b"\xff\xfe", b"\xfe\xff")
+        content = parse_json(data.decode("utf-16" if is_utf16 else "utf-8-sig"))
+        json.dumps(content, ensure_ascii=False).encode()  # fails on lone surrogates, which no name can hold
+    except json.JSONDecodeError as error:
+        at = f"line {error.lineno}, column {error.colno}"
+        raise UnreadableJsonError(f"is not valid JSON ({error.msg} at {at}); was it cut short?") from error
+    except (UnicodeError, RecursionError) as error:  # the latter in dumps
+        raise UnreadableJsonError(f"is not readable as JSON ({type(error).__name__})") from error
+    except ValueError as error:  # far too many values, or too deep; numbers of thousands of digits
+        raise UnreadableJsonError(f"is not readable as JSON ({str(error).partition(';')[0]})") from error
+    return content
+
+
+def parse_json(text: str) -> Any:
+    """The value in a text of JSON. Raises ValueError: it is none, gives a key twice with different values, of which
+    nobody knows the right one, is nested too deeply, or has so many values that they would take far more memory than
+    the text."""
     if len(text) > MOST_TEXT_BYTES:
         needed = sum(text.count(letter) * size for letter, size in _BYTES_OF.items())
         if needed > _PARSED_BYTES:
             raise ValueError(
                 f"its values would take up to {needed:,} bytes, and at most {_PARSED_BYTES:,} are read"
             )
-    return json.loads(text, object_pairs_hook=_each_once)
+    try:
+        return json.loads(text, object_pairs_hook=_each_once)
+    except RecursionError as error:
+        raise ValueError("nested far too deeply") from error
 
 
 def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -12,8 +12,8 @@ import trimesh
 from tests.factories.ball_model import RADIUS, SHADE, ball_scene, cameras_around
 from tests.factories.ball_page import box
 from tests.factories.cameras import FRAME
-from unmix_plugin.engine.runs.atomic_files import RUN_FORMAT
 from unmix_plugin.engine.runs.run_folder import RunFolder
+from unmix_plugin.engine.runs.run_json import RUN_FORMAT
 from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.trained import measured_surface
 from unmix_plugin.trained.measured_surface import MeasuredSurface

@@ -8,8 +8,8 @@ import pytest
 
 from tests.factories.ball_model import RADIUS, ball_scene, cameras_around
 from tests.factories.cameras import FRAME
-from unmix_plugin.engine.runs.atomic_files import RUN_FORMAT
 from unmix_plugin.engine.runs.run_folder import RunFolder
+from unmix_plugin.engine.runs.run_json import RUN_FORMAT
 from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.trained import measures
 from unmix_plugin.trained.protocol import Probe

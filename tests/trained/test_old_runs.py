@@ -10,10 +10,9 @@ from pathlib import Path
 import pytest
 
 from unmix_plugin import open_run
-from unmix_plugin.engine.runs.atomic_files import RUN_FORMAT
 from unmix_plugin.engine.runs.config_json import config_to_json, flattened
 from unmix_plugin.engine.runs.load_run import load_config, load_model
-from unmix_plugin.engine.runs.migrations import OLDEST_FORMAT, migrated
+from unmix_plugin.engine.runs.run_json import OLDEST_FORMAT, RUN_FORMAT, read_run_json
 
 RUNS = Path(__file__).parent / "runs"
 
@@ -54,7 +53,6 @@ def test_what_format_7_chose_anew_at_each_load_stays_what_it_was(run):
 
 def test_each_step_leads_to_the_next_format(run):
     for path in run.rglob("*.json"):
-        values = migrated(json.loads(path.read_text()), RUN_FORMAT)
-        assert values["format_version"] == RUN_FORMAT
+        assert read_run_json(path)["format_version"] == RUN_FORMAT
     stored = flattened(config_to_json(load_config(run)))
     assert stored["pipeline.model.renderer.first_smallest_weight"] == "auto"

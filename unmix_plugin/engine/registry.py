@@ -6,7 +6,7 @@ import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any, Protocol
 
 from unmix_plugin.engine.configs import TrainerConfig, place_of
@@ -93,11 +93,17 @@ def discover_methods() -> tuple[dict[str, MethodSpecification], list[BrokenPlugi
     methods: dict[str, MethodSpecification] = {}
     broken: list[BrokenPlugin] = []
     for entry_point in sorted(entry_points(group=METHOD_GROUP), key=lambda entry: (entry.name, entry.value)):
-        found = _load(entry_point)
-        if isinstance(found, MethodSpecification) and found.name in methods:
-            found = BrokenPlugin(entry_point.name, f"a method {found.name} is registered already")
-        if isinstance(found, BrokenPlugin):
-            broken.append(found)
+        try:
+            found = entry_point.load()
+        except Exception as error:  # noqa: BLE001 - a third party's module may fail in any way at all
+            lines = str(error).strip().splitlines() or ["no message"]
+            broken.append(BrokenPlugin(entry_point.name, f"{type(error).__name__}: {lines[0]}"))
+            continue
+        if not isinstance(found, MethodSpecification):
+            reason = f"{entry_point.value} is a {type(found).__name__}, not a MethodSpecification"
+            broken.append(BrokenPlugin(entry_point.name, reason))
+        elif found.name in methods:
+            broken.append(BrokenPlugin(entry_point.name, f"a method {found.name} is registered already"))
         else:
             methods[found.name] = found
     return methods, broken
@@ -134,17 +140,3 @@ def find_method(name: str) -> MethodSpecification:
     lines = [f"unknown method {name!r}{did_you_mean(name, methods, likeness=0.5, form='; {}')}"]
     lines.append(f"installed: {', '.join(sorted(methods)) or 'none'}")
     raise ConfigError("\n".join(lines + [str(plugin) for plugin in broken]))
-
-
-def _load(entry_point: EntryPoint) -> MethodSpecification | BrokenPlugin:
-    # A third party's module may fail in any way at all; one broken plugin must not take the others with it.
-    try:
-        found = entry_point.load()
-    except Exception as error:  # noqa: BLE001
-        lines = str(error).strip().splitlines() or ["no message"]
-        return BrokenPlugin(entry_point.name, f"{type(error).__name__}: {lines[0]}")
-    if not isinstance(found, MethodSpecification):
-        return BrokenPlugin(
-            entry_point.name, f"{entry_point.value} is a {type(found).__name__}, not a MethodSpecification"
-        )
-    return found

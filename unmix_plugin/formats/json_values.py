@@ -1,4 +1,4 @@
-"""JSON of unknown origin: read whole, described in messages, and converted key by key to what a schema asks for.
+"""Values of JSON of unknown origin: described in messages, and converted key by key to what a schema asks for.
 
 A schema is a `msgspec.Struct` whose fields are optional and say by `Meta(description=...)` what is expected. Every
 wrong value is noted, not only the first, so that a user mends a file in one go.
@@ -10,37 +10,10 @@ import json
 import math
 from collections.abc import Callable, Mapping
 from functools import cache
-from pathlib import Path
 from typing import Any, TypeVar, get_args, get_type_hints
 
 import msgspec
 import numpy as np
-
-from unmix_plugin.limits import MOST_TABLE_BYTES, parse_json, read_bounded
-
-
-class UnreadableJsonError(ValueError):
-    """A file holds no JSON; the text says why."""
-
-
-def read_json_file(path: Path) -> Any:
-    """The value in a JSON file. Raises UnreadableJsonError: it is not in UTF-8 or UTF-16, not JSON, nested too deeply,
-    or has text that is not Unicode. Raises OSError: it cannot be opened."""
-    data = read_bounded(path, MOST_TABLE_BYTES)
-    if not data.strip(b"\xef\xbb\xbf\t\r\n "):
-        raise UnreadableJsonError("is empty; expected JSON")
-    try:
-        is_utf16 = data[:2] in (b"\xff\xfe", b"\xfe\xff")
-        content = parse_json(data.decode("utf-16" if is_utf16 else "utf-8-sig"))
-        json.dumps(content, ensure_ascii=False).encode()  # fails on lone surrogates, which no name can hold
-    except json.JSONDecodeError as error:
-        at = f"line {error.lineno}, column {error.colno}"
-        raise UnreadableJsonError(f"is not valid JSON ({error.msg} at {at}); was it cut short?") from error
-    except (UnicodeError, RecursionError) as error:
-        raise UnreadableJsonError(f"is not readable as JSON ({type(error).__name__})") from error
-    except ValueError as error:  # far too many values, numbers of thousands of digits
-        raise UnreadableJsonError(f"is not readable as JSON ({str(error).partition(';')[0]})") from error
-    return content
 
 
 def describe(value: Any) -> str:

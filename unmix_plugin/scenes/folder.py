@@ -25,8 +25,8 @@ import numpy as np
 from jaxtyping import Float64
 from msgspec import Meta
 
-from unmix_plugin.formats.json_values import UnreadableJsonError, describe, read_json_file, read_keys
-from unmix_plugin.limits import GREATEST_PX
+from unmix_plugin.formats.json_values import describe, read_keys
+from unmix_plugin.limits import GREATEST_PX, UnreadableJsonError, read_json
 from unmix_plugin.scenes.messages import Message
 from unmix_plugin.scenes.reading.faults import FILE_NAME, Faults
 
@@ -343,7 +343,7 @@ def load_transforms(root: Path, faults: Faults) -> Transforms:
         faults.note(FILE_NAME, Message.NO_FILE)
     else:
         try:
-            content = read_json_file(root / FILE_NAME)
+            content = read_json(root / FILE_NAME)
             if not isinstance(content, dict):
                 faults.note(FILE_NAME, Message.NO_OBJECT, found=describe(content))
         except OSError as error:

@@ -26,13 +26,8 @@ from msgspec import Meta
 
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.formats.files import safe_name
-from unmix_plugin.formats.json_values import (
-    UnreadableJsonError,
-    describe,
-    read_json_file,
-    read_keys,
-    read_number,
-)
+from unmix_plugin.formats.json_values import describe, read_keys, read_number
+from unmix_plugin.limits import UnreadableJsonError, read_json
 from unmix_plugin.scenes.folder import (
     Transforms,
     lens_keys,
@@ -110,7 +105,7 @@ def check_frames_per_second(value: float | int | None, where: str) -> float:
 def read_camera_file(path: Path, frame: Normalisation) -> _CameraFile:
     """Read the cameras of a file, or raise a ConfigError; `frame` leads from world to model space."""
     try:
-        content = read_json_file(path)
+        content = read_json(path)
     except OSError as error:
         raise ConfigError(f"can't read the camera file {path}: {error.strerror or error}") from error
     except UnreadableJsonError as error:

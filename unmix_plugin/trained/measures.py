@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from unmix_plugin.engine.runs.atomic_files import read_run_json, write_run_json
 from unmix_plugin.engine.runs.run_folder import RunFolder, RunLock
+from unmix_plugin.engine.runs.run_json import read_run_json, write_run_json
 from unmix_plugin.errors import ConfigError, RunError, did_you_mean
 from unmix_plugin.scenes.folder import METRES_KEY, METRES_RANGE
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION

@@ -27,7 +27,7 @@ from jaxtyping import Bool, Float64, Int64
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from unmix_plugin.engine.runs.atomic_files import read_run_json, write_run_json
+from unmix_plugin.engine.runs.run_json import read_run_json, write_run_json
 from unmix_plugin.engine.sampling import robust_deviation
 from unmix_plugin.errors import RunError
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from unmix_plugin.engine.runs.atomic_files import read_run_json, write_run_json
+from unmix_plugin.engine.runs.run_json import read_run_json, write_run_json
 from unmix_plugin.trained.training_views import ThinnedView
 
 FILE_NAME = "training_views.json"

@@ -19,8 +19,7 @@ from jaxtyping import Float64, UInt8
 
 from unmix_plugin.captures.poses.lens import Lens, require_possible
 from unmix_plugin.errors import CaptureError, counted, name_some
-from unmix_plugin.formats.json_values import UnreadableJsonError, read_json_file
-from unmix_plugin.limits import MOST_TABLE_BYTES, parse_xml, read_bounded
+from unmix_plugin.limits import MOST_TABLE_BYTES, UnreadableJsonError, parse_xml, read_bounded, read_json
 from unmix_plugin.scenes.placement import Placement
 
 if TYPE_CHECKING:
@@ -298,7 +297,7 @@ def load_json(path: Path) -> Any:
     """What a file holds; CaptureError where it can't be read, or is no JSON."""
     try:
         with reading(path):
-            return read_json_file(path)
+            return read_json(path)
     except UnreadableJsonError as error:
         raise CaptureError(f"{path} {error}") from error
 

@@ -1,31 +1,18 @@
-"""Files that a kill, a crash or a full disk at any moment leaves whole: the old one or the new one, never a part.
-
-The JSON files of a run have one format version for all of them, and nothing is read that no run writes.
-"""
+"""Files that a kill, a crash or a full disk at any moment leaves whole: the old one or the new one, never a part; and
+names that every system takes."""
 
 import contextlib
 import errno
 import hashlib
-import json
 import os
 import re
 import unicodedata
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
-from unmix_plugin.engine.runs.migrations import OLDEST_FORMAT, migrated
-from unmix_plugin.engine.runs.replacing import (
-    drop_claim,
-    hash_of,
-    is_ours,
-    list_file,
-    put_in_place,
-    temporary_name,
-)
+from unmix_plugin.engine.runs.replacing import drop_claim, put_in_place, temporary_name
 from unmix_plugin.errors import RunError
-from unmix_plugin.limits import DEEPEST, MOST_TABLE_BYTES, parse_json, read_bounded
 
 _CHUNK_BYTES = 1 << 26
 """Bytes handed to one write."""
@@ -162,108 +149,3 @@ def _sync(path: Path, flags: int) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-RUN_FORMAT = 8
-"""Version of everything in a run folder; raised when an older version of this package could not read it, with a step in
-`migrations` that brings files of the version before to this one."""
-
-_LARGEST_INTEGER = 2**63
-_LARGEST_NUMBER = 1e18
-"""Of scenes, poses and lights none comes near; what is computed from larger ones would leave float32."""
-
-
-class OtherFormatError(RunError):
-    """A file of a run was written by a version of this package that is too new or too old."""
-
-
-def write_run_json(path: Path, values: dict[str, Any]) -> None:
-    """Write `values` and the format version as readable JSON, whole or not at all, in place of a file of a run, be it
-    from before lists of files were kept, or edited by hand, which the caller has read.
-
-    Raises:
-        RunError: the disk is full or refuses, or a file is there that no run wrote.
-        TypeError, ValueError: a value that JSON has no form for, or a number that is not finite.
-    """
-    text = json.dumps({"format_version": RUN_FORMAT, **values}, indent=1, allow_nan=False)
-    with write_errors_as(path):
-        adopt_run_json(path)
-    write_file(path, (text + "\n").encode())
-
-
-def adopt_run_json(path: Path) -> None:
-    """Make a file that reads as one of a run one that may be replaced and removed. Raises OSError."""
-    if os.path.lexists(path) and not is_ours(path):
-        with contextlib.suppress(RunError):
-            read_run_json(path)
-            list_file(path, hash_of(path))
-
-
-def read_run_json(path: Path) -> dict[str, Any]:
-    """The object in a JSON file of a run.
-
-    Raises:
-        RunError: it is missing, cut off, or holds what no run writes.
-        OtherFormatError: another version of this package wrote it.
-    """
-    try:
-        values = read_plain_json(path)
-    except FileNotFoundError as error:
-        raise RunError(
-            f"{path} is missing: the run is half-written or was moved in part; train again"
-        ) from error
-    version = values.get("format_version") if isinstance(values, dict) else None
-    if type(version) is not int:
-        raise RunError(f"{path} is not a file of a run: it has no format_version")
-    if not OLDEST_FORMAT <= version <= RUN_FORMAT:
-        age, advice = ("a newer", "update this package")
-        if version < RUN_FORMAT:
-            age, advice = ("an older", "train again, or use the version that trained it")
-        raise OtherFormatError(
-            f"{path} has format {version}, written by {age} version; this one reads formats {OLDEST_FORMAT} to "
-            f"{RUN_FORMAT}: {advice}"
-        )
-    return migrated(values, RUN_FORMAT)
-
-
-def read_plain_json(path: Path) -> Any:
-    """The value in any JSON file of a run folder.
-
-    Raises:
-        FileNotFoundError: there is none.
-        RunError: it is no regular file, too long, cut off, or holds what no run writes.
-    """
-    try:
-        return parse_plain_json(read_bounded(path, MOST_TABLE_BYTES).decode("utf-8-sig"))
-    except FileNotFoundError:
-        raise
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise RunError(f"can't read {path}: {reason}; the run is damaged") from error
-
-
-def parse_plain_json(text: str) -> Any:
-    """The value in a text of JSON. Raises ValueError: it is none, or holds what no run writes."""
-    try:
-        value = parse_json(text)
-        _require_plain(value, DEEPEST)
-    except RecursionError as error:
-        raise ValueError(f"nested more than {DEEPEST} levels deep") from error
-    return value
-
-
-def _require_plain(value: Any, depth: int) -> None:
-    """Refuse what Python's JSON reader accepts and no run writes."""
-    if depth == 0:
-        raise ValueError(f"nested more than {DEEPEST} levels deep")
-    if isinstance(value, dict | list):
-        for entry in [*value, *value.values()] if isinstance(value, dict) else value:
-            _require_plain(entry, depth - 1)
-    elif isinstance(value, str):
-        os.fsencode(value)  # may become a path; raises for a lone surrogate
-        if "\0" in value:
-            raise ValueError(f"text with a null character: {value[:40]!r}")
-    elif isinstance(value, float) and not abs(value) <= _LARGEST_NUMBER:
-        raise ValueError(f"the number {value}")
-    elif isinstance(value, int) and abs(value) >= _LARGEST_INTEGER:
-        raise ValueError("an integer beyond 64 bits")

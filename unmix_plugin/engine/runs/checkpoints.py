@@ -14,19 +14,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import safetensors.torch
 from safetensors import SafetensorError
 from torch import Tensor, nn
 
 from unmix_plugin.engine.configs import require_in_range
-from unmix_plugin.engine.runs.atomic_files import (
-    OtherFormatError,
-    adopt_run_json,
-    read_run_json,
-    whole_file,
-    write_run_json,
-)
-from unmix_plugin.engine.runs.config_json import config_from_json
+from unmix_plugin.engine.runs.atomic_files import whole_file
 from unmix_plugin.engine.runs.replacing import (
     hash_of,
     list_file,
@@ -35,6 +29,7 @@ from unmix_plugin.engine.runs.replacing import (
     remove_stale_temporaries,
 )
 from unmix_plugin.engine.runs.run_folder import checkpoint_steps
+from unmix_plugin.engine.runs.run_json import OtherFormatError, adopt_run_json, read_run_json, write_run_json
 from unmix_plugin.engine.training.optimizers import Adam, ParameterAverage
 from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.limits import read_bounded
@@ -73,7 +68,7 @@ def save_checkpoint(
             are as they were.
     """
     require_sound(tensors)
-    tensors_path, record_path = folder / f"{_stem(step)}.safetensors", folder / f"{_stem(step)}.json"
+    tensors_path, record_path = folder / f"step-{step:06d}.safetensors", folder / f"step-{step:06d}.json"
     try:
         folder.mkdir(parents=True, exist_ok=True)
         remove_stale_temporaries(folder)
@@ -116,53 +111,36 @@ def newest_complete_checkpoint(folder: Path) -> Checkpoint:
     """
     damaged: list[str] = []
     for step in checkpoint_steps(folder):
-        found = _read(folder / f"{_stem(step)}.json")
-        if not isinstance(found, str):
-            return Checkpoint(step, *found, tuple(damaged))
-        damaged.append(f"{_stem(step)}: {found}")
+        stem = f"step-{step:06d}"
+        try:
+            record = read_run_json(folder / f"{stem}.json")
+            data = read_bounded(folder / f"{stem}.safetensors", _MOST_BYTES)
+            if hashlib.sha256(data).hexdigest() != record.get("sha256"):
+                raise RunError("the tensors do not have the hash of the record")
+            tensors = safetensors.torch.load(data)
+            require_sound(tensors)
+            return Checkpoint(step, tensors, record, tuple(damaged))
+        except OtherFormatError:
+            raise
+        except (OSError, RunError, SafetensorError, ValueError, KeyError, RuntimeError) as error:
+            damaged.append(f"{stem}: {error}")
     reason = "training ended before the first was saved"
     if damaged:
         reason = f"the files there are damaged or cut short ({damaged[0]}); copy the run again, or train anew"
     raise RunError(f"no complete checkpoint in {folder}: {reason}")
 
 
-def _read(record_path: Path) -> tuple[dict[str, Tensor], dict[str, Any]] | str:
-    """Tensors and record of a checkpoint, or what is wrong with it."""
-    try:
-        record = read_run_json(record_path)
-        data = read_bounded(record_path.with_suffix(".safetensors"), _MOST_BYTES)
-        if hashlib.sha256(data).hexdigest() != record.get("sha256"):
-            return "the tensors do not have the hash of the record"
-        tensors = safetensors.torch.load(data)
-        require_sound(tensors)
-        return tensors, record
-    except OtherFormatError:
-        raise
-    except (OSError, RunError, SafetensorError, ValueError, KeyError, RuntimeError) as error:
-        return str(error)
-
-
 def require_sound(tensors: Mapping[str, Tensor]) -> None:
     """Refuse what no training goes on from, and no run is shown from. Raises RunError: a tensor has values that are not
     finite."""
-    broken = next((name for name, tensor in tensors.items() if not _is_sound(name, tensor)), None)
-    if broken is not None:
-        raise RunError(f"{broken} has values that are not finite")
-
-
-def _is_sound(name: str, tensor: Tensor) -> bool:
-    """Whether a tensor holds numbers; what a model keeps beside its parameters may be infinite."""
-    is_small = tensor.is_floating_point() and tensor.element_size() == 1  # of which torch can't ask it
-    for values in tensor.detach().reshape(-1).split(_JUDGED_TOGETHER):
-        values = values.float() if is_small else values
-        is_sound = values.isnan().logical_not() if name.startswith(MODEL) else values.isfinite()
-        if not is_sound.all():
-            return False
-    return True
-
-
-def _stem(step: int) -> str:
-    return f"step-{step:06d}"
+    for name, tensor in tensors.items():
+        is_small = tensor.is_floating_point() and tensor.element_size() == 1  # of which torch can't ask it
+        for values in tensor.detach().reshape(-1).split(_JUDGED_TOGETHER):
+            values = values.float() if is_small else values
+            # What a model keeps beside its parameters may be infinite.
+            is_sound = values.isnan().logical_not() if name.startswith(MODEL) else values.isfinite()
+            if not is_sound.all():
+                raise RunError(f"{name} has values that are not finite")
 
 
 def _separate(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -189,7 +167,7 @@ def _remove_others(folder: Path, step: int, keep: int) -> None:
     steps = checkpoint_steps(folder)
     kept = [other for other in steps if other <= step][:keep]
     for other in set(steps) - set(kept):
-        _remove(folder / f"{_stem(other)}.json", folder / f"{_stem(other)}.safetensors")
+        _remove(folder / f"step-{other:06d}.json", folder / f"step-{other:06d}.safetensors")
 
 
 def _remove(record_path: Path, tensors_path: Path) -> None:
@@ -244,11 +222,10 @@ class TrainingRecord:
     def from_json(values: Mapping[str, Any]) -> "TrainingRecord":
         """What `to_json` wrote, further entries ignored. Raises RunError: an entry is missing, of another type, or
         negative."""
-        known = {name: values.get(name) for name in TrainingRecord.__dataclass_fields__}
         try:
-            return config_from_json(known, TrainingRecord(0, 0.0, 0, 0, 1, 0, 0.0, {}), "the record")
-        except ConfigError as error:
-            raise RunError(f"the checkpoint is damaged: {error}") from error
+            return msgspec.convert(dict(values), TrainingRecord)
+        except (msgspec.ValidationError, ConfigError) as error:
+            raise RunError(f"the checkpoint is damaged: its record: {error}") from error
 
 
 def collect_tensors(model: nn.Module, optimizer: Adam, average: ParameterAverage | None) -> dict[str, Tensor]:

@@ -8,23 +8,29 @@ import dataclasses
 import math
 import types
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import msgspec
 
 from unmix_plugin.errors import ConfigError
 
 ConfigT = TypeVar("ConfigT")
+_type_hints = cache(get_type_hints)
 
 
 def config_to_json(value: Any) -> Any:
-    """Numbers, strings, booleans, None, lists and dictionaries that say what the config says.
+    """Numbers, strings, booleans, None, lists and dictionaries that say what the config says; not its fields that begin
+    with `_`.
 
     Raises:
         ConfigError: a number is infinite or not a number.
         TypeError: a config holds something that is not a plain value.
     """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {field.name: config_to_json(getattr(value, field.name)) for field in _fields(value)}
+        names = (field.name for field in dataclasses.fields(value) if not field.name.startswith("_"))
+        return {name: config_to_json(getattr(value, name)) for name in names}
     if isinstance(value, Mapping):
         return {str(key): config_to_json(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
@@ -41,10 +47,15 @@ def config_to_json(value: Any) -> Any:
 def require_kept(config: Any, default: Any) -> None:
     """Refuse settings that a run could not keep. Raises ConfigError: they are read back as others, or not at all, also
     over the method's `default`. TypeError: as `config_to_json`."""
-    if any(config_from_json(config_to_json(config), base) != config for base in (config, default)):
+    kept, why = config_to_json(config), ""
+    try:
+        is_kept = all(config_from_json(kept, base) == config for base in (config, default))
+    except ConfigError as error:
+        is_kept, why = False, f" ({error})"
+    if not is_kept:
         raise ConfigError(
-            "the settings are read back as others: keys of mappings must be text, lists lists, and classes that may "
-            "stand in one place must differ in their fields"
+            f"the settings are read back as others{why}: keys of mappings must be text, lists lists, and classes that "
+            "may stand in one place must differ in their fields"
         )
 
 
@@ -72,12 +83,10 @@ def config_from_json(values: Any, default: ConfigT, where: str = "config") -> Co
         ConfigError: an unknown field or a value of the wrong type or range, with the path of the field.
     """
     if not isinstance(values, dict):
-        raise _WrongTypeError(where, "an object", values)
-    known = {field.name: field for field in _fields(default)}
-    unknown = sorted(set(values) - set(known))
-    if unknown:
+        raise ConfigError(f"{where}: expected an object, found {values!r:.60}")
+    hints = {name: hint for name, hint in _type_hints(type(default)).items() if not name.startswith("_")}
+    if unknown := sorted(values.keys() - hints.keys()):
         raise ConfigError(f"{where}: {type(default).__name__} has no field {', '.join(unknown)}")
-    hints = get_type_hints(type(default))
     changes = {
         name: value_from_json(value, hints[name], getattr(default, name), f"{where}.{name}")
         for name, value in values.items()
@@ -88,92 +97,37 @@ def config_from_json(values: Any, default: ConfigT, where: str = "config") -> Co
         raise ConfigError(f"{where}: {error}") from error
 
 
-class _WrongTypeError(ConfigError):
-    """A value of another type than expected."""
-
-    def __init__(self, where: str, expected: str, value: Any) -> None:
-        text = repr(value)
-        found = f"{type(value).__name__} {text if len(text) <= 60 else text[:57] + '...'}"
-        super().__init__(f"{where}: expected {expected}, found {found}")
-        self.where, self.expected = where, expected
-
-
-def _fields(config: Any) -> list[dataclasses.Field[Any]]:
-    return [field for field in dataclasses.fields(config) if not field.name.startswith("_")]
-
-
 def value_from_json(value: Any, hint: Any, default: Any, where: str) -> Any:
     """One value as the type `hint` says, `default` what it was before; ConfigError names `where`."""
     if get_origin(hint) is Annotated:
         hint = get_args(hint)[0]
-    origin = get_origin(hint)
-    if origin in (Union, types.UnionType):
-        return _read_union(value, get_args(hint), default, where)
-    if origin is Literal:
-        if any(value == choice and type(value) is type(choice) for choice in get_args(hint)):
-            return value
-        raise _WrongTypeError(where, f"one of {', '.join(map(repr, get_args(hint)))}", value)
-    if origin is tuple or origin is list:
-        return _read_sequence(value, origin, get_args(hint), default, where)
-    if isinstance(origin, type) and issubclass(origin, Mapping):
-        if not isinstance(value, dict):
-            raise _WrongTypeError(where, "an object", value)
-        of_entries, defaults = get_args(hint)[1], default if isinstance(default, Mapping) else {}
+    kind, inner = get_origin(hint), get_args(hint)
+    choices = inner if kind in (Union, types.UnionType) else (hint,)
+    configs = [choice for choice in choices if dataclasses.is_dataclass(choice)]
+    if configs and isinstance(value, dict):
+        configs.sort(key=lambda config: not isinstance(default, config))
+        problems = []
+        for config in configs:
+            try:
+                return config_from_json(value, default if isinstance(default, config) else config(), where)
+            except ConfigError as error:  # noqa: PERF203
+                problems.append(str(error))
+        raise ConfigError("; or ".join(problems))
+    if isinstance(value, dict) and inner and dataclasses.is_dataclass(inner[-1]):
+        known = default if isinstance(default, Mapping) else {}
         return {
-            key: value_from_json(entry, of_entries, defaults.get(key), f"{where}.{key}")
+            key: value_from_json(entry, inner[-1], known.get(key), f"{where}.{key}")
             for key, entry in value.items()
         }
-    if dataclasses.is_dataclass(hint) and isinstance(hint, type):
-        return config_from_json(value, default if isinstance(default, hint) else hint(), where)
-    return _read_scalar(value, hint, where)
+    plain = [choice for choice in choices if choice not in configs]
+    try:
+        return msgspec.convert(value, Union[tuple(plain)] if plain else dict, dec_hook=_read_path)  # noqa: UP007
+    except (msgspec.ValidationError, TypeError) as error:  # TypeError: it can't read such a type
+        expected = hint.__name__ if isinstance(hint, type) else str(hint).replace("typing.", "")
+        raise ConfigError(f"{where}: expected {expected}, found {value!r:.60}") from error
 
 
-def _read_union(value: Any, choices: tuple[Any, ...], default: Any, where: str) -> Any:
-    """The member type of `default` is tried first, then the others in their order."""
-    classes = [choice for choice in choices if isinstance(choice, type) and get_origin(choice) is None]
-    fits_default = [choice for choice in classes if isinstance(default, choice)]
-    problems: list[ConfigError] = []
-    for choice in fits_default + [choice for choice in choices if choice not in fits_default]:
-        try:
-            return value_from_json(value, choice, default, where)
-        except ConfigError as error:  # noqa: PERF203
-            problems.append(error)
-    mismatches = [
-        problem for problem in problems if isinstance(problem, _WrongTypeError) and problem.where == where
-    ]
-    if len(mismatches) == len(problems):
-        expected = sorted((problem.expected for problem in mismatches), key=lambda kind: kind == "null")
-        raise _WrongTypeError(where, " or ".join(expected), value)
-    raise ConfigError("; or ".join(map(str, problems)))
-
-
-def _read_sequence(value: Any, kind: type, hints: tuple[Any, ...], default: Any, where: str) -> Any:
-    if not isinstance(value, list):
-        raise _WrongTypeError(where, "a list", value)
-    repeated = kind is list or (len(hints) == 2 and hints[1] is Ellipsis)
-    if not repeated and len(value) != len(hints):
-        raise ConfigError(f"{where}: expected {len(hints)} entries, found {len(value)}")
-    defaults = default if isinstance(default, kind) and len(default) == len(value) else [None] * len(value)
-    return kind(
-        value_from_json(entry, hints[0] if repeated else hints[i], defaults[i], f"{where}[{i}]")
-        for i, entry in enumerate(value)
-    )
-
-
-def _read_scalar(value: Any, hint: Any, where: str) -> Any:
-    kinds = {
-        type(None): "null",
-        Path: "a path",
-        float: "a number",
-        int: "an integer",
-        bool: "true or false",
-        str: "text",
-    }
-    hint = type(None) if hint is None else hint
-    if hint is Path and isinstance(value, str):
+def _read_path(kind: type, value: Any) -> Any:
+    if kind is Path and isinstance(value, str):
         return Path(value)
-    if hint is float and type(value) is int:
-        return float(value)
-    if type(value) is hint:
-        return value
-    raise _WrongTypeError(where, kinds.get(hint, str(hint)), value)
+    raise TypeError(f"no setting of the type {kind.__name__} can be read")

@@ -9,7 +9,6 @@ from unmix_plugin.engine.machine import resolve_device
 from unmix_plugin.engine.model import Model
 from unmix_plugin.engine.pipeline import Pipeline
 from unmix_plugin.engine.registry import find_method
-from unmix_plugin.engine.runs.atomic_files import read_run_json, write_run_json
 from unmix_plugin.engine.runs.checkpoints import (
     MODEL,
     Checkpoint,
@@ -20,6 +19,7 @@ from unmix_plugin.engine.runs.checkpoints import (
 )
 from unmix_plugin.engine.runs.config_json import config_from_json, config_to_json, flattened
 from unmix_plugin.engine.runs.run_folder import RunFolder, open_run_folder
+from unmix_plugin.engine.runs.run_json import read_run_json, write_run_json
 from unmix_plugin.engine.runs.scene_record import SceneRecord, check_same_scene, read_scene_record
 from unmix_plugin.errors import ConfigError, RunError, UnmixError, UnmixWarning, name_some
 
@@ -56,11 +56,8 @@ def load_model(path: Path, device: str = "auto") -> LoadedModel:
         RunError: the run is missing, half-written, damaged, or from another version.
         ConfigError: the device is not there.
     """
-    run, place = open_run_folder(path), resolve_device(device)
-    config = load_config(path)
-    scene = read_scene_record(run, config.pipeline.datamanager.target)
-    checkpoint = _newest_checkpoint(run)
-    _require_fitting_tensors(config, scene, checkpoint)
+    place = resolve_device(device)
+    run, config, scene, checkpoint = _read_run(path)
     try:
         model = config.pipeline.model.setup(scene_box=scene.scene_box, metadata=scene.metadata)
     except (UnmixError, LookupError, TypeError, ValueError, ArithmeticError) as error:
@@ -78,11 +75,8 @@ def load_pipeline(path: Path, device: str = "auto", data: Path | None = None) ->
         SceneError: the scene is missing or malformed.
         ConfigError: the device is not there.
     """
-    run, place = open_run_folder(path), resolve_device(device)
-    config = load_config(path)
-    scene = read_scene_record(run, config.pipeline.datamanager.target)
-    checkpoint = _newest_checkpoint(run)
-    _require_fitting_tensors(config, scene, checkpoint)
+    place = resolve_device(device)
+    run, config, scene, checkpoint = _read_run(path)
     config = config if data is None else replace(config, data=data)
     pipeline: Pipeline = config.pipeline.setup(data=require_data(config), device=place, seed=config.seed)
     check_same_scene(scene, pipeline.datamanager, run)
@@ -90,25 +84,24 @@ def load_pipeline(path: Path, device: str = "auto", data: Path | None = None) ->
     return LoadedPipeline(run, config, pipeline.eval(), scene, TrainingRecord.from_json(checkpoint.record))
 
 
-def _require_fitting_tensors(config: TrainerConfig, scene: SceneRecord, checkpoint: Checkpoint) -> None:
-    """Refuse what a model would take too much memory for, before it is made. Raises RunError."""
+def _read_run(path: Path) -> tuple[RunFolder, TrainerConfig, SceneRecord, Checkpoint]:
+    """All that the folder of a run holds for its model, with a warning where newer checkpoints are damaged; what a
+    model would take too much memory for is refused before it is made. Raises RunError."""
+    run = open_run_folder(path)
+    config = _read_config(run)
+    scene = read_scene_record(run, config.pipeline.datamanager.target)
+    checkpoint = newest_complete_checkpoint(run.checkpoints)
+    if checkpoint.damaged:
+        passed_over = "; ".join(checkpoint.damaged)
+        message = f"{run.path} is shown as it was after step {checkpoint.step}: passed over {passed_over}"
+        warnings.warn(message, UnmixWarning, stacklevel=3)
     try:
         config.pipeline.model.target.check_tensors(scene.metadata, part(checkpoint.tensors, MODEL))
     except (UnmixError, LookupError, TypeError, ValueError) as error:
         raise RunError(
             f"the checkpoint does not fit the model that config and scene describe: {error}; train again"
         ) from error
-
-
-def _newest_checkpoint(run: RunFolder) -> Checkpoint:
-    """The newest complete checkpoint, with a warning where it isn't the newest."""
-    found = newest_complete_checkpoint(run.checkpoints)
-    if found.damaged:
-        message = (
-            f"{run.path} is shown as it was after step {found.step}: passed over {'; '.join(found.damaged)}"
-        )
-        warnings.warn(message, UnmixWarning, stacklevel=3)
-    return found
+    return run, config, scene, checkpoint
 
 
 def load_config(path: Path) -> TrainerConfig:
@@ -118,9 +111,11 @@ def load_config(path: Path) -> TrainerConfig:
         RunError: the run is missing, half-written or from another version, its settings lack some or do not fit the
             method, or the method is not installed.
     """
-    run = open_run_folder(path)
-    values = read_run_json(run.config_path)
-    stored = values.get("config")
+    return _read_config(open_run_folder(path))
+
+
+def _read_config(run: RunFolder) -> TrainerConfig:
+    stored = read_run_json(run.config_path).get("config")
     name = stored.get("method_name") if isinstance(stored, dict) else None
     try:
         config = config_from_json(stored, find_method(str(name)).config)

@@ -90,7 +90,18 @@ def open_run_folder(path: Path) -> RunFolder:
         if not path.is_dir():
             raise RunError(f"no run folder at {path}; give the path that training printed as its last line")
         run = RunFolder(path.resolve())
-        _refuse_links_out(run.path)
+        # Whoever made the folder must not choose which other files get written. `exports` may be a folder elsewhere, as
+        # on a larger disk: no file of others is replaced there.
+        is_elsewhere = run.exports.is_symlink() and run.exports.is_dir()
+        for top in (run.path, run.exports.resolve()) if is_elsewhere else (run.path,):
+            inside = (Path(at, name) for at, folders, files in os.walk(top) for name in (*folders, *files))
+            for link in filter(Path.is_symlink, inside):
+                if link.resolve().is_relative_to(top) or (is_elsewhere and link == run.exports):
+                    continue
+                raise RunError(
+                    f"{link} is a link that leads out of the run folder, to {link.resolve()}; "
+                    "put what it leads to in its place, or remove it"
+                )
         missing = [file.name for file in (run.config_path, run.scene_path) if not file.is_file()]
     except (OSError, RuntimeError) as error:  # names too long, links in a circle
         raise RunError(f"can't open the run folder {path}: {error}") from error
@@ -119,21 +130,6 @@ def checkpoint_steps(folder: Path) -> list[int]:
     """Steps of the checkpoints in `folder`, newest first, complete or not."""
     stems = (path.stem.removeprefix("step-") for path in folder.glob("step-*.json"))
     return sorted((int(stem) for stem in stems if stem.isascii() and stem.isdigit()), reverse=True)
-
-
-def _refuse_links_out(root: Path) -> None:
-    """Whoever made the folder must not choose which other files get written. `exports` may be a folder elsewhere, as on
-    a larger disk: no file of others is replaced there."""
-    exports = root / "exports"
-    allowed = {exports} if exports.is_symlink() and exports.is_dir() else set()
-    for top in (root, *(path.resolve() for path in allowed)):
-        for folder, folders, files in os.walk(top):
-            for path in (Path(folder, name) for name in (*folders, *files)):
-                if path.is_symlink() and not path.resolve().is_relative_to(top) and path not in allowed:
-                    raise RunError(
-                        f"{path} is a link that leads out of the run folder, to {path.resolve()}; "
-                        "put what it leads to in its place, or remove it"
-                    )
 
 
 class RunLock:

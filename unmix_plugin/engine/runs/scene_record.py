@@ -10,15 +10,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import msgspec
 import numpy as np
 import torch
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.engine.model import DataManager
-from unmix_plugin.engine.runs.atomic_files import NOT_PORTABLE, parse_plain_json, read_run_json, safe_name
+from unmix_plugin.engine.runs.atomic_files import NOT_PORTABLE, safe_name
 from unmix_plugin.engine.runs.config_json import flattened
 from unmix_plugin.engine.runs.run_folder import RunFolder
+from unmix_plugin.engine.runs.run_json import parse_plain_json, read_run_json
 from unmix_plugin.errors import ConfigError, RunError, name_some
 
 
@@ -73,18 +75,51 @@ def read_scene_record(run: RunFolder, kind: type[DataManager] = DataManager) -> 
 _MISFITS = (LookupError, TypeError, ValueError, RuntimeError, OverflowError, ConfigError)
 
 
+class _Record(msgspec.Struct):
+    """Entries of `scene.json`."""
+
+    scene_box: tuple[tuple[float, float, float], tuple[float, float, float]]
+    metadata: dict[str, Any]
+    train_cameras: dict[str, Any]
+    eval_cameras: dict[str, Any]
+    summary: dict[str, Any]
+
+
+class _Views(msgspec.Struct):
+    """Entries of a summary that the engine reads: names of frames, and which of them are training and evaluation views;
+    none where the data manager notes none."""
+
+    frames: list[str] = []
+    train_indices: list[int] = []
+    eval_indices: list[int] = []
+
+
 def _record_of(values: dict[str, Any], kind: type[DataManager]) -> SceneRecord:
     """The record that is written as these values by a data manager of that kind. Raises one of `_MISFITS`."""
-    metadata, summary = _dictionary(values, "metadata"), _dictionary(values, "summary")
+    found = msgspec.convert(values, _Record)
     record = SceneRecord(
-        SceneBox(torch.tensor(values["scene_box"], dtype=torch.float32).reshape(2, 3)),
-        metadata,
-        Cameras.from_json(values["train_cameras"]),
-        Cameras.from_json(values["eval_cameras"]),
-        summary,
+        SceneBox(torch.tensor(found.scene_box, dtype=torch.float32)),
+        found.metadata,
+        Cameras.from_json(found.train_cameras),
+        Cameras.from_json(found.eval_cameras),
+        found.summary,
     )
-    _check_frames(record)
-    kind.check_record(metadata, summary)
+    if "frames" in found.summary:
+        views = msgspec.convert(found.summary, _Views)
+        if len(set(views.frames)) != len(views.frames):
+            raise ValueError("frames must be a list of different names")
+        for name in views.frames:
+            if name != safe_name(name, NOT_PORTABLE):  # names of views become names of files
+                raise ValueError(f"{name!r} can't be the name of a frame: it is not a plain file name")
+        for split, indices, cameras in (
+            ("train", views.train_indices, record.train_cameras),
+            ("eval", views.eval_indices, record.eval_cameras),
+        ):
+            if len(indices) not in (0, len(cameras)):
+                raise ValueError(f"{split}_indices must have an entry for each of {len(cameras)} views")
+            if not all(0 <= index < len(views.frames) for index in indices):
+                raise ValueError(f"{split}_indices must count from 0 to {len(views.frames) - 1}")
+    kind.check_record(found.metadata, found.summary)
     return record
 
 
@@ -104,31 +139,6 @@ def check_same_scene(scene: SceneRecord, datamanager: DataManager, run: RunFolde
             f"the scene at {datamanager.data} is not the one that {run.path} was trained on: "
             f"{name_differences(differing)}; name the right one with --data"
         )
-
-
-def _dictionary(values: dict[str, Any], name: str) -> dict[str, Any]:
-    if not isinstance(values[name], dict):
-        raise TypeError(f"{name} must be an object; found {type(values[name]).__name__}")
-    return values[name]
-
-
-def _check_frames(record: SceneRecord) -> None:
-    """Names of views become names of files."""
-    summary = record.summary
-    if "frames" not in summary:
-        return
-    frames = summary["frames"]
-    if not isinstance(frames, list) or len(set(map(str, frames))) != len(frames):
-        raise ValueError("frames must be a list of different names")
-    for name in frames:
-        if not isinstance(name, str) or name != safe_name(name, NOT_PORTABLE):
-            raise ValueError(f"{name!r} can't be the name of a frame: it is not a plain file name")
-    for split, cameras in (("train", record.train_cameras), ("eval", record.eval_cameras)):
-        indices = summary.get(f"{split}_indices", [])
-        if not isinstance(indices, list) or len(indices) not in (0, len(cameras)):
-            raise ValueError(f"{split}_indices must be a list with an entry for each of {len(cameras)} views")
-        if not all(type(index) is int and 0 <= index < len(frames) for index in indices):
-            raise ValueError(f"{split}_indices must count from 0 to {len(frames) - 1}")
 
 
 _RELATIVE_TOLERANCE = 1e-4

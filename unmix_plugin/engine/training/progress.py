@@ -23,9 +23,10 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.segment import Segment
 
 from unmix_plugin.engine.printing import cleaned, terminal_text
-from unmix_plugin.engine.runs.atomic_files import cannot_write, parse_plain_json, write_file
+from unmix_plugin.engine.runs.atomic_files import cannot_write, write_file
 from unmix_plugin.engine.runs.replacing import hash_of, list_file, move_aside
 from unmix_plugin.engine.runs.run_folder import RunFolder
+from unmix_plugin.engine.runs.run_json import parse_plain_json
 from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.limits import MOST_TABLE_BYTES, read_bounded, regular_file
 

@@ -15,7 +15,6 @@ from unmix_plugin.engine.decisions import decision_table
 from unmix_plugin.engine.machine import keep_freed_memory
 from unmix_plugin.engine.processes import ALONE, Processes
 from unmix_plugin.engine.registry import discover_methods
-from unmix_plugin.engine.runs.atomic_files import adopt_run_json, write_run_json
 from unmix_plugin.engine.runs.checkpoints import (
     AVERAGE,
     TrainingRecord,
@@ -35,6 +34,7 @@ from unmix_plugin.engine.runs.run_folder import (
     create_run_folder,
     open_run_folder,
 )
+from unmix_plugin.engine.runs.run_json import adopt_run_json, write_run_json
 from unmix_plugin.engine.runs.scene_record import check_same_scene, read_scene_record, scene_record_to_json
 from unmix_plugin.engine.training.optimizers import AVERAGE_INTERVAL, ParameterAverage
 from unmix_plugin.engine.training.progress import (

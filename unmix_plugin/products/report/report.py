@@ -20,9 +20,9 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from unmix_plugin import __version__
-from unmix_plugin.engine.runs.atomic_files import read_plain_json, read_run_json, write_run_json
 from unmix_plugin.engine.runs.config_json import config_to_json
 from unmix_plugin.engine.runs.run_folder import RunFolder
+from unmix_plugin.engine.runs.run_json import read_plain_json, read_run_json, write_run_json
 from unmix_plugin.errors import ConfigError, RunError, counted
 from unmix_plugin.figures.paint import scale_strip
 from unmix_plugin.figures.plotting import SpectraChart, css_colour, draw_chart
