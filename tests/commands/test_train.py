@@ -264,7 +264,7 @@ def test_training_from_python_takes_the_names_of_flags_and_gives_a_scene(trained
         ({"pipeline.model.loses.rgb": 1}, "did you mean pipeline.model.losses.rgb"),
         ({"qqq": 1}, "has no setting qqq; unmix-train unmix-nerf --help-all lists all"),
         ({"endmembers": 3, "pipeline.model.num-endmembers": 3}, "are the same setting: give one"),
-        ({"endmembers": "six"}, "num_endmembers: expected an integer or one of 'auto' or null, found str"),
+        ({"endmembers": "six"}, "num_endmembers: expected int or 'auto' or None, found 'six'"),
         ({"max_seconds": -1}, "max-seconds above 0"),
         ({"seed": object()}, "seed: a config holds a object"),
         ({"data": "other"}, "the scene is demo, and data is other"),

@@ -10,7 +10,7 @@ import types
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import msgspec
 
@@ -123,7 +123,14 @@ def value_from_json(value: Any, hint: Any, default: Any, where: str) -> Any:
     try:
         return msgspec.convert(value, Union[tuple(plain)] if plain else dict, dec_hook=_read_path)  # noqa: UP007
     except (msgspec.ValidationError, TypeError) as error:  # TypeError: it can't read such a type
-        expected = hint.__name__ if isinstance(hint, type) else str(hint).replace("typing.", "")
+        words = []
+        for choice in choices:
+            if get_origin(choice) is Literal:
+                words += map(repr, get_args(choice))
+            else:
+                is_plain = isinstance(choice, type) and not get_args(choice)
+                words.append(choice.__name__ if is_plain else str(choice))
+        expected = " or ".join(words).replace("NoneType", "None")
         raise ConfigError(f"{where}: expected {expected}, found {value!r:.60}") from error
 
 
