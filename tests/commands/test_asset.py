@@ -1,4 +1,5 @@
-"""`unmix-asset`: one command from cubes to glTF, textures, light, page and what is what; and what it refuses."""
+"""`unmix-asset`: one command from cubes or a capture to glTF, textures, light, page and what is what; and what it
+refuses."""
 
 import json
 
@@ -17,13 +18,18 @@ FILES = ("material.glb", "material.json", "abundances.exr", "endmembers.csv", "e
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     """What the command makes of a ball without mesh and light, and what it prints."""
-    folder = write_spectral_object(tmp_path_factory.mktemp("asset") / "ball", metres_per_unit=0.5)
+    words = small(tmp_path_factory.mktemp("asset") / "ball")
+    return words[3], done(asset, *words), words
+
+
+def small(ball):
+    """A ball without mesh and light, and options with which an object is made of it in a moment."""
+    write_spectral_object(ball, metres_per_unit=0.5)
     for name in ("mesh.ply", "environment.exr"):
-        (folder / name).unlink()
-    words = ["--data", folder, "--output", folder.parent / "made", "--output-dir", folder.parent / "out"]
+        (ball / name).unlink()
+    words = ["--data", ball, "--output", ball.parent / "made", "--output-dir", ball.parent / "out"]
     words += ["--field-seconds", 4, "--material-seconds", 1, "--endmembers", 2, "--mesh-triangles", 400]
-    words += ["--texture-size", 256, "--page-resolution", 32, "--device", "cpu"]
-    return folder.parent / "made", done(asset, *words), words
+    return [*words, "--texture-size", 256, "--page-resolution", 32, "--device", "cpu"]
 
 
 @pytest.mark.slow
@@ -62,6 +68,21 @@ def test_the_light_is_written_in_all_bands(made):
 
 
 @pytest.mark.slow
+def test_a_capture_is_made_a_scene_first_with_the_options_of_unmix_process(tmp_path):
+    words = small(tmp_path / "ball")
+    ended = done(asset, "unmix-nerf", *words, "--drop-bands", 600)
+    scene = tmp_path / "out" / "scenes" / "ball"
+    assert 600 not in json.loads((scene / "transforms.json").read_text())["wavelengths"]
+    assert (
+        f"unmix-process unmix-nerf --data {tmp_path / 'ball'} --output-dir {scene} --drop-bands 600"
+        in ended.out
+    )
+    assert "[6/6]" in ended.out
+    assert (tmp_path / "made" / "asset.json").is_file()
+    assert "holds a scene already" in refused(asset, "unmix-nerf", *words, "--output", tmp_path / "other")
+
+
+@pytest.mark.slow
 def test_earlier_files_stay(made):
     folder, _, words = made
     before = (folder / "asset.json").read_bytes()
@@ -74,3 +95,11 @@ def test_files_of_others_and_odd_times_are_refused_before_anything_is_trained(tm
     assert "asset.json" in refused(asset, "--data", "demo", "--output", tmp_path)
     assert "--field-seconds is -1" in refused(asset, "--data", "demo", "--field-seconds", -1)
     assert "--material-seconds is inf" in refused(asset, "--data", "demo", "--material-seconds", "inf")
+
+
+def test_options_of_unmix_process_are_checked_before_a_capture_is_read(tmp_path):
+    capture = ["--data", tmp_path, "--output-dir", tmp_path]
+    assert "'inspect' is not a layout" in refused(asset, "inspect", *capture)
+    needs_white = refused(asset, "cubes", *capture, "--white-reflectance", 0.9)
+    assert "--white-reflectance needs a white reference" in needs_white
+    assert "whose LAYOUT comes first" in refused(asset, *capture, "--scene", tmp_path / "scene")

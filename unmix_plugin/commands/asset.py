@@ -1,15 +1,17 @@
-"""`unmix-asset --data SCENE`: from posed spectral images to an object that any light can fall on.
+"""`unmix-asset --data SCENE` or `unmix-asset LAYOUT --data CAPTURE`: from spectral images, posed or as an instrument
+wrote them, to an object that any light can fall on.
 
-A radiance field of materials, the surface and the light that it tells, relightable materials fitted on them, the
-evaluation on views left out, and files for other programs: what `unmix-train` twice, `unmix-eval` and `unmix-export`
-do one after the other.
+A scene of the capture, a radiance field of materials, the surface and the light that it tells, relightable materials
+fitted on them, the evaluation on views left out, and files for other programs: what `unmix-process`, `unmix-train`
+twice, `unmix-eval` and `unmix-export` do one after the other.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import count
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,19 +21,22 @@ from unmix_plugin.engine.configs import DeviceName
 from unmix_plugin.engine.printing import tell
 from unmix_plugin.errors import ConfigError
 
-_STEPS = 5
-
 
 @dataclass(frozen=True)
 class _AssetOptions:
     """Make an object of a scene folder: train a field, take mesh and light from it, fit relightable materials, evaluate
     them, and write glTF, textures of materials, the environment, a page and asset.json, which says what is what.
 
+    Before all options there may be a LAYOUT of unmix-process, as in unmix-asset cubes --data CAPTURE --white FILE: the
+    scene is then made of a capture first, and all options of unmix-process are taken, too (unmix-process --help).
+
     Every step can be repeated and changed by the command that is printed before it.
     """
 
     data: Path
-    """Folder of posed spectral images, as unmix-train takes it."""
+    """Folder of posed spectral images, as unmix-train takes it; after a LAYOUT that of the capture."""
+    scene: Path | None = None
+    """After a LAYOUT: folder to write the scene to; None: of the capture's name, in scenes/ of --output-dir."""
     output: Path | None = None
     """Folder to write to; None: exports/asset in the second run's folder."""
     field_seconds: float = 300.0
@@ -53,7 +58,7 @@ class _AssetOptions:
     output_dir: Path = Path("outputs")
     """Folder for the two runs."""
     overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Replace earlier files in the output folder."""
+    """Replace earlier files in the output folder, and a scene that was made of a capture."""
     device: DeviceName = "auto"
     """Where to compute; auto takes CUDA where there is one."""
 
@@ -65,10 +70,11 @@ class _AssetOptions:
 
 def asset(arguments: list[str]) -> None:
     """Parse the arguments, do what the commands do, say what was written where."""
-    options = tyro.cli(_AssetOptions, prog="unmix-asset", args=arguments)
+    options, of_capture = _parse(arguments)
 
     from unmix_plugin.commands.eval import evaluate
     from unmix_plugin.commands.export import export
+    from unmix_plugin.commands.process import process
     from unmix_plugin.commands.reporting import shell_line
     from unmix_plugin.commands.train import train
     from unmix_plugin.engine.runs.run_folder import newest_run
@@ -78,13 +84,19 @@ def asset(arguments: list[str]) -> None:
         refuse_to_overwrite([options.output / _MANIFEST], options.overwrite)
     device = ["--device", options.device]
     runs = ["--output-dir", str(options.output_dir), *device]
+    numbers = count(1)
 
-    def step(number: int, what: str, program: str, words: Sequence[str]) -> None:
-        tell(f"\n[{number}/{_STEPS}] {what}\n{shell_line(program, *words)}")
+    def step(what: str, program: str, words: Sequence[str]) -> None:
+        number = f"{next(numbers)}/{5 + bool(of_capture)}"
+        tell(f"\n[{number}] {what}\n{shell_line(program, *words)}")
+
+    if of_capture:
+        step("a scene of the capture", "unmix-process", of_capture)
+        process(of_capture)
 
     words = ["unmix-nerf", "--data", str(options.data), "--max-seconds", f"{options.field_seconds:g}", *runs]
     words += [] if options.endmembers is None else ["--endmembers", options.endmembers]
-    step(1, "a radiance field of materials", "unmix-train", words)
+    step("a radiance field of materials", "unmix-train", words)
     train(words)
     field = newest_run(options.output_dir).path
 
@@ -92,21 +104,21 @@ def asset(arguments: list[str]) -> None:
     words += ["--mesh-triangles", str(options.mesh_triangles)]
     for name, path in (("--mesh", options.mesh), ("--environment", options.environment)):
         words += [] if path is None else [name, str(path)]
-    step(2, "mesh, light, and materials on the mesh", "unmix-train", words)
+    step("mesh, light, and materials on the mesh", "unmix-train", words)
     train(words)
     run = newest_run(options.output_dir)
 
     words = ["--run", str(run.path), *device]
-    step(3, "evaluation on views left out", "unmix-eval", words)
+    step("evaluation on views left out", "unmix-eval", words)
     evaluate(words)
 
     folder = (options.output or run.exports / "asset").resolve()
     common = [*words, "--output", str(folder), *(["--overwrite"] if options.overwrite else [])]
     words = ["material", *common, "--texture-size", str(options.texture_size)]
-    step(4, "glTF and textures", "unmix-export", words)
+    step("glTF and textures", "unmix-export", words)
     export(words)
     words = ["page", *common, "--resolution", str(options.page_resolution)]
-    step(5, "a page in 3-D", "unmix-export", words)
+    step("a page in 3-D", "unmix-export", words)
     export(words)
     manifest = _write_manifest(folder, field, run.path)
     tell(f"\nobject: {folder / 'material.glb'}, {folder / 'page.html'}")
@@ -115,6 +127,29 @@ def asset(arguments: list[str]) -> None:
 
 
 _MANIFEST, _ENVIRONMENT = "asset.json", "environment.exr"
+
+
+def _parse(arguments: Sequence[str]) -> tuple[_AssetOptions, list[str]]:
+    """What was asked, `data` a scene folder, and the words of unmix-process that make it of a capture; none where it
+    is there. Raises ConfigError: options of unmix-process that no capture makes right."""
+    if not arguments or arguments[0].startswith("-"):
+        options = tyro.cli(_AssetOptions, prog="unmix-asset", args=arguments)
+        if options.scene is not None:
+            raise ConfigError(
+                "--scene is where the scene of a capture goes, whose LAYOUT comes first, as in unmix-asset cubes "
+                "--data CAPTURE; a scene folder that is there is named with --data alone"
+            )
+        return options, []
+
+    from unmix_plugin.captures.options import ProcessOptions, check_options
+
+    layout, *others = arguments
+    options, remaining = tyro.cli(_AssetOptions, prog="unmix-asset", args=others, return_unknown_args=True)
+    scene = options.scene or options.output_dir / "scenes" / options.data.resolve().name
+    words = [layout, "--data", str(options.data), "--output-dir", str(scene), *remaining]
+    words += ["--overwrite"] if options.overwrite else []
+    check_options(tyro.cli(ProcessOptions, prog=f"unmix-asset {layout}", args=words))
+    return replace(options, data=scene), words
 
 
 def _write_manifest(folder: Path, field: Path, path: Path) -> Path:
