@@ -103,7 +103,7 @@ def value_from_json(value: Any, hint: Any, default: Any, where: str) -> Any:
         hint = get_args(hint)[0]
     kind, inner = get_origin(hint), get_args(hint)
     choices = inner if kind in (Union, types.UnionType) else (hint,)
-    configs = [choice for choice in choices if dataclasses.is_dataclass(choice)]
+    configs: list[Any] = [choice for choice in choices if dataclasses.is_dataclass(choice)]
     if configs and isinstance(value, dict):
         configs.sort(key=lambda config: not isinstance(default, config))
         problems = []

@@ -35,7 +35,7 @@ class OtherFormatError(RunError):
 def _with_first_smallest_weight(values: dict[str, Any]) -> dict[str, Any]:
     """Format 8: what was `auto` and follows from the scene stands as a value in config.json, as the model settles it
     when it is opened; and the renderer's weight at the start of training is a setting of its own."""
-    config = values.get("config")
+    config: Any = values.get("config")
     try:
         pipeline = config["pipeline"]
         renderer = {"first_smallest_weight": "auto", **pipeline["model"]["renderer"]}
