@@ -1,12 +1,13 @@
 """What the field guarantees at every point."""
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.factories.models import BOX, CONFIG
+from tests.factories.models import BOX, CONFIG, WAVELENGTHS_NM
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.field import FieldSpace, UnmixField
 from unmix_plugin.light.shading import direction_features
@@ -24,8 +25,8 @@ def make_field(
     **settings,
 ) -> UnmixField:
     torch.manual_seed(0)
-    config = replace(CONFIG.field, scale=scale, temperature=temperature)
-    space = FieldSpace(BOX, 2.0, 0.087, coarse_to_fine=coarse_to_fine)
+    config = replace(CONFIG.field, finest_resolution=8, scale=scale, temperature=temperature)
+    space = FieldSpace(BOX, 2.0, coarse_to_fine=coarse_to_fine)
     field = UnmixField(config, space, 3, num_specular, **settings)
     torch.nn.init.normal_(field.table)
     torch.nn.init.normal_(field.material_network[-1].weight)  # pyright: ignore[reportArgumentType]
@@ -121,8 +122,12 @@ def test_direction_features_are_orthogonal_over_the_sphere():
 def test_levels_have_more_rows_where_a_scene_is_many_pixels_large_unless_their_number_is_set():
     edge = float(BOX.size.max())
 
-    def rows(config):
-        return [config.settled(edge, pixel).log2_rows_per_level for pixel in PIXELS]
+    def settled(config: UnmixFieldConfig, pixel: float) -> UnmixFieldConfig:
+        metadata = {"wavelengths_nm": WAVELENGTHS_NM, "has_alpha": True, "pixel_size": pixel}
+        return replace(CONFIG, field=config).settled(edge, metadata).field
+
+    def rows(config: UnmixFieldConfig) -> list[Any]:
+        return [settled(config, pixel).log2_rows_per_level for pixel in PIXELS]
 
     sizes = rows(UnmixFieldConfig())
     assert (sizes[0], sizes[-1]) == (16, 19)
@@ -130,7 +135,7 @@ def test_levels_have_more_rows_where_a_scene_is_many_pixels_large_unless_their_n
     assert len(set(sizes)) == 4
     assert set(rows(UnmixFieldConfig(log2_rows_per_level=12))) == {12}
     fine = UnmixFieldConfig(cells_per_pixel=2.0)
-    assert [fine.settled(edge, size).finest_resolution for size in (0.01, 0.04)] == [400, 100]
+    assert [settled(fine, size).finest_resolution for size in (0.01, 0.04)] == [400, 100]
     for number in (3, 25):
         with pytest.raises(ConfigError, match="log2-rows-per-level of 4 to 24 or auto"):
             UnmixFieldConfig(log2_rows_per_level=number)

@@ -7,7 +7,6 @@ its area, so several rays are cast through it, one in each cell of a grid on it;
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -24,7 +23,7 @@ from unmix_plugin.engine.machine import step_generator
 from unmix_plugin.engine.model import DataManager, TrainingCallback, TrainingCallbackLocation
 from unmix_plugin.light.search import find_lamp
 from unmix_plugin.poses.knots import Knots
-from unmix_plugin.presets import choose, preset_for
+from unmix_plugin.presets import fill_auto, preset_for
 from unmix_plugin.scenes.doctor import (
     Finding,
     check_bands,
@@ -97,10 +96,10 @@ class HyperspectralDataManager(DataManager):
         self.eval_cameras = self.scene.cameras[list(self.scene.eval_indices)]
         self._rays = PixelRays(self.scene, device)
         preset = preset_for(self.scene.has_alpha, self.scene.is_unbounded, self.scene.has_backdrop)
-        self.config = self.options = replace(
+        self.config = self.options = fill_auto(
             config,
-            subpixels=choose(config.subpixels, 1 if self._num_train_pixels > _MANY_PIXELS else 2),
-            single_ray_until=choose(config.single_ray_until, preset.single_ray_until),
+            subpixels=1 if self._num_train_pixels > _MANY_PIXELS else 2,
+            single_ray_until=preset.single_ray_until,
         )
         self._num_rays = config.train_num_rays_per_batch
         self._choose_subpixels(step=0, progress=0.0)

@@ -108,8 +108,6 @@ class FieldSpace:
     """The scene box, model space."""
     initial_density: float
     """Density of the untrained field, per scene unit."""
-    pixel_size: float
-    """Edge of a pixel in the middle of the scene, scene units."""
     is_unbounded: bool = False
     """Whether the field is defined in all of space, contracted around the box, with a sky behind."""
     has_backdrop: bool = False
@@ -142,7 +140,7 @@ class GridField(CoefficientField):
     ) -> None:
         """
         Args:
-            config: Sizes.
+            config: Sizes, none of them `auto`.
             num_endmembers: K.
             sees_positions: Whether features have PE beside g, and not the number that density is made of.
         """
@@ -152,13 +150,12 @@ class GridField(CoefficientField):
         self.is_unbounded, self._has_backdrop = space.is_unbounded, space.has_backdrop
         self.num_encoded = config.num_levels * config.features_per_level
         self.log_initial_density = math.log(space.initial_density)
-        sizes = config.settled(float(space.box.size.max()), space.pixel_size, space.is_unbounded)
         self.layout = HashGridLayout(
             config.num_levels,
             config.features_per_level,
             config.coarsest_resolution,
-            int(sizes.finest_resolution) * (2 if space.is_unbounded else 1),
-            int(sizes.log2_rows_per_level),
+            int(config.finest_resolution) * (2 if space.is_unbounded else 1),
+            int(config.log2_rows_per_level),
         )
         low, high = space.box.aabb
         self.register_buffer("aabb", space.box.aabb.clone())

@@ -24,7 +24,7 @@ from jaxtyping import Bool
 from torch import Tensor, nn
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.space import RayBundle, SceneBox, UnitSpace
+from unmix_plugin.engine.geometry.space import RayBundle, UnitSpace
 from unmix_plugin.engine.model import (
     DataManager,
     Model,
@@ -49,7 +49,7 @@ from unmix_plugin.losses.terms import (
 from unmix_plugin.operators.occupancy import OccupancyGrid
 from unmix_plugin.poses.refinement import PoseRefinement
 from unmix_plugin.poses.training import CorrectedRays, PoseTraining
-from unmix_plugin.presets import AlphaPreset, choose, preset_for
+from unmix_plugin.presets import fill_auto, preset_for
 from unmix_plugin.rendering.front_to_back import composite_view
 from unmix_plugin.rendering.grid_upkeep import GRID_INTERVAL, update_grid
 from unmix_plugin.rendering.renderer import RenderedRays, VolumeRenderer
@@ -68,88 +68,6 @@ _COARSE_PART = 0.5
 """Part of the training in which samples move together to the distance they have in the end."""
 _FIRST_PART = 0.05
 """Part of the training in which lighter samples may have gradients than later."""
-
-
-@dataclass(frozen=True)
-class SceneTraits:
-    """What the parts of a model are shaped by, from a data manager's metadata."""
-
-    bands: Bands
-    has_alpha: bool
-    is_unbounded: bool
-    has_backdrop: bool
-    pixel_size: float
-    """Edge of a pixel in the middle of the scene, scene units."""
-
-    @staticmethod
-    def of(metadata: Mapping[str, Any]) -> SceneTraits:
-        """Of a scene with this metadata."""
-        centers, widths = (metadata.get(key) for key in ("wavelengths_nm", "fwhm_nm"))
-        return SceneTraits(
-            bands=Bands(np.array(centers, float), None if widths is None else np.array(widths, float)),
-            has_alpha=metadata["has_alpha"],
-            is_unbounded=bool(metadata.get("is_unbounded", False)),
-            has_backdrop=bool(metadata.get("has_backdrop", False)),
-            pixel_size=metadata["pixel_size"],
-        )
-
-    @property
-    def is_carved(self) -> bool:
-        """Whether pictures tell where nothing is."""
-        return self.has_alpha or self.has_backdrop
-
-    @property
-    def preset(self) -> AlphaPreset:
-        """What `auto` means in settings of such a scene."""
-        return preset_for(self.has_alpha, self.is_unbounded, self.has_backdrop)
-
-
-def new_field(
-    config: UnmixModelConfig,
-    scene: SceneTraits,
-    box: SceneBox,
-    num_endmembers: int,
-    num_specular: int,
-    step: float,
-) -> GridField:
-    """The untrained field of K endmembers and J specular coefficients; samples lie `step` apart at first."""
-    opacity = float(config.initial_opacity)
-    sizes, refines = config.field, config.poses == "refine"
-    if refines:
-        sizes = replace(sizes, coarsest_resolution=min(sizes.coarsest_resolution, COARSEST_REFINED))
-    space = FieldSpace(
-        box,
-        initial_density=-math.log1p(-opacity) / step,
-        pixel_size=scene.pixel_size,
-        is_unbounded=scene.is_unbounded,
-        has_backdrop=scene.has_backdrop,
-        coarse_to_fine=refines,
-    )
-    if config.as_published:
-        return PublishedField(sizes, space, num_endmembers, num_specular)
-    return UnmixField(
-        sizes,
-        space,
-        num_endmembers,
-        num_specular,
-        exposure=float(config.losses.exposure),
-        lit_by_camera=config.light == "camera",
-        lamp=lamp_of(config),
-    )
-
-
-def lamp_of(config: UnmixModelConfig) -> Lamp | None:
-    """Where the lamp that moves with the camera is before training; None if there is none or that is not known."""
-    return Lamp.of_numbers([float(number) for number in config.lamp]) if config.lamp else None
-
-
-def new_grid(
-    config: UnmixModelConfig, scene: SceneTraits, reachable: Bool[torch.Tensor, "X Y Z"]
-) -> OccupancyGrid:
-    """The grid before training. Where little was carved, cells are too many to wait until each was probed: what rays
-    meet in them counts as well."""
-    records_observed = not scene.is_carved or config.poses == "refine"
-    return OccupancyGrid(reachable, lamp_of(config) is not None, records_observed)
 
 
 @dataclass(frozen=True)
@@ -184,24 +102,53 @@ class UnmixModel(Model):
         """Field, grid, endmembers (K, B) and specular spectra (J, B), shaped by config and metadata. Raises
         ConfigError: more endmembers than bands."""
         metadata, box = self.metadata, self.scene_box
+        nm, fwhm_nm = metadata["wavelengths_nm"], metadata.get("fwhm_nm")
+        self.bands = Bands(np.array(nm, float), None if fwhm_nm is None else np.array(fwhm_nm, float))
+        self.is_unbounded = bool(metadata.get("is_unbounded"))
+        has_backdrop = bool(metadata.get("has_backdrop"))
+        self.is_carved = bool(metadata["has_alpha"]) or has_backdrop  # pictures tell where nothing is
+        self.preset = preset_for(metadata["has_alpha"], self.is_unbounded, has_backdrop)
         self.longest_edge = float(box.size.max())
         config = self.config = self.config.settled(self.longest_edge, metadata)
-        scene = SceneTraits.of(metadata)
-        self.bands, self.preset, self.is_carved = scene.bands, scene.preset, scene.is_carved
-        self.is_unbounded, self.has_backdrop = scene.is_unbounded, scene.has_backdrop
         assert isinstance(config.num_endmembers, int)
-        num_bands, self.num_endmembers = len(scene.bands), config.num_endmembers
-        num_dictionary = config.num_dictionary_spectra(scene.preset, self.num_endmembers)
+        assert isinstance(config.num_specular_spectra, int)
+        self.lamp = Lamp.of_numbers([float(number) for number in config.lamp]) if config.lamp else None
+        """Where the lamp that moves with the camera is before training; None if there is none or that is not known."""
+
+        num_bands, self.num_endmembers = len(self.bands), config.num_endmembers
+        num_dictionary = config.num_specular_spectra if config.specular == "dictionary" else 0
+        num_specular = num_bands if config.specular == "full" else num_dictionary
         spectra = torch.zeros(self.num_endmembers, num_bands)
         self.endmembers = nn.Parameter(spectra, requires_grad=config.train_endmembers)
         self.specular_spectra = nn.Parameter(torch.zeros(num_dictionary, num_bands))
-        self.step = scene.pixel_size / float(config.renderer.samples_per_pixel)
-        self.grid = new_grid(config, scene, torch.ones((metadata["grid_resolution"],) * 3, dtype=torch.bool))
-        num_specular = num_bands if config.specular == "full" else num_dictionary
-        self.field = new_field(
-            config, scene, box, self.num_endmembers, num_specular, self.step * self._coarseness(0.0)
+        self.step = metadata["pixel_size"] / float(config.renderer.samples_per_pixel)
+        self.grid = self._new_grid(torch.ones((metadata["grid_resolution"],) * 3, dtype=torch.bool))
+        refines = config.poses == "refine"
+        first_step = self.step * self._coarseness(0.0)
+        space = FieldSpace(
+            box,
+            initial_density=-math.log1p(-float(config.initial_opacity)) / first_step,
+            is_unbounded=self.is_unbounded,
+            has_backdrop=has_backdrop,
+            coarse_to_fine=refines,
         )
-        self.register_buffer("rgb_weights", rgb_matrix(scene.bands), persistent=False)
+        sizes = config.field
+        if refines:
+            sizes = replace(sizes, coarsest_resolution=min(sizes.coarsest_resolution, COARSEST_REFINED))
+        self.field: GridField
+        if config.as_published:
+            self.field = PublishedField(sizes, space, self.num_endmembers, num_specular)
+        else:
+            self.field = UnmixField(
+                sizes,
+                space,
+                self.num_endmembers,
+                num_specular,
+                exposure=float(config.losses.exposure),
+                lit_by_camera=config.light == "camera",
+                lamp=self.lamp,
+            )
+        self.register_buffer("rgb_weights", rgb_matrix(self.bands), persistent=False)
         self.register_buffer("every_band", torch.eye(num_bands), persistent=False)
         self.register_buffer("endmember_bound", torch.ones(()))
         self.guide = AbundanceGuide(self.num_endmembers, num_bands)
@@ -216,7 +163,7 @@ class UnmixModel(Model):
             self._pose_training = PoseTraining(config.pose_refinement, self.poses)
         self.seen_by = SensorViews(metadata.get("sensors", ()), self.rgb_weights)
         weights = tuple(float(weight) for weight in config.losses.band_weights)
-        self.balance = BandBalance(weights, scene.bands, self.seen_by)
+        self.balance = BandBalance(weights, self.bands, self.seen_by)
         self.comparison = BatchComparison(
             config.losses,
             seen_by=self.seen_by,
@@ -239,7 +186,7 @@ class UnmixModel(Model):
             ConfigError: the file has another number of spectra than `num_endmembers`.
         """
         usual = SAMPLES_ON_CPU if self.device.type == "cpu" else SAMPLES_ON_GPU
-        self.config = replace(self.config, samples_per_step=choose(self.config.samples_per_step, usual))
+        self.config = fill_auto(self.config, samples_per_step=usual)
         light = self.metadata["illuminant"]
         lamp = torch.ones(len(self.bands)) if light is None else torch.tensor(light, dtype=torch.float32)
         endmembers = first_endmembers(
@@ -264,7 +211,13 @@ class UnmixModel(Model):
             knots, pixel_size = torch.from_numpy(initial_data["knots"]), self.metadata["pixel_size"]
             self.poses.begin(knots, self.scene_box, pixel_size)
             reachable = torch.ones_like(reachable)  # poses that are off carve away what is there
-        self.grid = new_grid(self.config, SceneTraits.of(self.metadata), reachable).to(self.device)
+        self.grid = self._new_grid(reachable).to(self.device)
+
+    def _new_grid(self, reachable: Bool[torch.Tensor, "X Y Z"]) -> OccupancyGrid:
+        """The grid before training. Where little was carved, cells are too many to wait until each was probed: what
+        rays meet in them counts as well."""
+        records_observed = not self.is_carved or self.config.poses == "refine"
+        return OccupancyGrid(reachable, self.lamp is not None, records_observed)
 
     @torch.no_grad()
     def between_steps(self, step: int, progress: float, data: DataManager) -> Collection[str]:

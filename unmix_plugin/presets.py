@@ -10,9 +10,10 @@ alpha, and the backdrop is learnt.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 Auto = Literal["auto"]
+ConfigT = TypeVar("ConfigT")
 
 
 @dataclass(frozen=True)
@@ -73,6 +74,7 @@ def preset_for(has_alpha: bool, is_unbounded: bool = False, has_backdrop: bool =
     return UNBOUNDED if is_unbounded else WITH_ALPHA if has_alpha else WITHOUT_ALPHA
 
 
-def choose(setting: Any, preset: Any) -> Any:
-    """A setting, or what the preset has where it is `auto`."""
-    return preset if setting == "auto" else setting
+def fill_auto(config: ConfigT, **values: Any) -> ConfigT:
+    """The settings with these values where they are `auto`."""
+    filled = {name: value for name, value in values.items() if getattr(config, name) == "auto"}
+    return replace(config, **filled)  # type: ignore[type-var]

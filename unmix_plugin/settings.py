@@ -22,7 +22,7 @@ from unmix_plugin.engine.configs import (
     short_flag,
 )
 from unmix_plugin.errors import Check, ConfigError, require
-from unmix_plugin.presets import AlphaPreset, Auto, choose, preset_for
+from unmix_plugin.presets import Auto, fill_auto, preset_for
 
 if TYPE_CHECKING:
     import numpy as np
@@ -178,20 +178,6 @@ class UnmixFieldConfig:
         ]
         require("the field", self, rules)
 
-    def settled(self, longest_edge: float, pixel_size: float, is_unbounded: bool = False) -> UnmixFieldConfig:
-        """With the cells and rows of a scene box of this longest edge, in the unit of a pixel's edge in its middle.
-
-        A surface passes through as many cells as it has area, so the rows that large scenes need grow with the square
-        of their resolution; small ones would only learn more slowly with more rows.
-        """
-        wanted = math.ceil(self.cells_per_pixel * longest_edge / pixel_size)
-        finest = choose(self.finest_resolution, min(wanted, LARGEST_RESOLUTION))
-        finest = max(self.coarsest_resolution, finest)
-        cells = 2 * finest if is_unbounded else finest
-        rows = round(math.log2(cells**2 * _ROWS_PER_CELL_OF_A_FACE))
-        rows = choose(self.log2_rows_per_level, max(_FEWEST_LOG2_ROWS, min(rows, _MOST_LOG2_ROWS)))
-        return replace(self, finest_resolution=finest, log2_rows_per_level=rows)
-
 
 @dataclass(frozen=True)
 class RendererConfig:
@@ -234,20 +220,6 @@ class RendererConfig:
             ),
         ]
         require("the renderer", self, rules)
-
-    def settled(self, longest_edge: float, pixel_size: float, preset: AlphaPreset) -> RendererConfig:
-        """With what a scene box of this longest edge, in the unit of a pixel's edge in its middle, and the scene's
-        preset ask for."""
-        is_coarse = not preset.is_carved or longest_edge > _LARGE_BOX * pixel_size
-        first = preset.first_smallest_weight if self.smallest_weight == "auto" else self.smallest_weight
-        return replace(
-            self,
-            samples_per_pixel=choose(self.samples_per_pixel, 1.0 if is_coarse else 1.5),
-            coarse_samples=choose(self.coarse_samples, preset.coarse_samples),
-            smallest_weight=choose(self.smallest_weight, preset.smallest_weight),
-            first_smallest_weight=choose(self.first_smallest_weight, first),
-            visible_weight=choose(self.visible_weight, preset.visible_weight),
-        )
 
 
 @dataclass(frozen=True)
@@ -453,39 +425,10 @@ class UnmixModelConfig(ModelConfig):
         Raises:
             ConfigError: more endmembers than bands.
         """
-        is_unbounded, pixel_size = bool(metadata.get("is_unbounded", False)), float(metadata["pixel_size"])
-        preset = preset_for(metadata["has_alpha"], is_unbounded, bool(metadata.get("has_backdrop", False)))
-        count = self.checked_num_endmembers(len(metadata["wavelengths_nm"]))
-        field = self.field
-        if self.poses == "refine":
-            field = replace(field, coarsest_resolution=min(field.coarsest_resolution, COARSEST_REFINED))
-        sizes = field.settled(longest_edge, pixel_size, is_unbounded)
-        losses = replace(
-            self.losses,
-            background=choose(self.losses.background, preset.background),
-            rgb=choose(self.losses.rgb, preset.rgb_loss_weight),
-            exposure=choose(self.losses.exposure, 1.0),
-            relative=choose(self.losses.relative, 0.0),
-            band_weights=choose(self.losses.band_weights, ()),
-        )
-        return replace(
-            self,
-            num_endmembers=count,
-            num_specular_spectra=max(self.num_dictionary_spectra(preset, count), 1),
-            light=choose(self.light, "fixed"),
-            lamp=choose(self.lamp, ()),
-            initial_opacity=choose(self.initial_opacity, preset.initial_opacity),
-            field=replace(
-                self.field,
-                finest_resolution=sizes.finest_resolution,
-                log2_rows_per_level=sizes.log2_rows_per_level,
-            ),
-            renderer=self.renderer.settled(longest_edge, pixel_size, preset),
-            losses=losses,
-        )
+        is_unbounded, pixel_size = bool(metadata.get("is_unbounded")), float(metadata["pixel_size"])
+        preset = preset_for(metadata["has_alpha"], is_unbounded, bool(metadata.get("has_backdrop")))
 
-    def checked_num_endmembers(self, num_bands: int) -> int:
-        """K. Raises ConfigError: more endmembers than bands."""
+        num_bands = len(metadata["wavelengths_nm"])
         count = _usual_num_endmembers(num_bands) if self.num_endmembers is None else self.num_endmembers
         if count == "auto":
             raise ConfigError("num-endmembers is auto: call resolve_auto first")
@@ -493,15 +436,51 @@ class UnmixModelConfig(ModelConfig):
             raise ConfigError(
                 f"num-endmembers is {count} but the scene has {num_bands} bands; choose at most {num_bands}"
             )
-        return count
+        of_endmembers = count if preset.specular_endmembers else 0
 
-    def num_dictionary_spectra(self, preset: AlphaPreset, num_endmembers: int) -> int:
-        """Spectra of the specular dictionary."""
-        if self.specular != "dictionary":
-            return 0
-        if self.num_specular_spectra == "auto":
-            return 1 + num_endmembers if preset.specular_endmembers else 1
-        return self.num_specular_spectra
+        field, renderer = self.field, self.renderer
+        coarsest = field.coarsest_resolution
+        if self.poses == "refine":
+            coarsest = min(coarsest, COARSEST_REFINED)
+        finest = min(math.ceil(field.cells_per_pixel * longest_edge / pixel_size), LARGEST_RESOLUTION)
+        finest = max(coarsest, finest if field.finest_resolution == "auto" else field.finest_resolution)
+        # A surface passes through as many cells as it has area, so the rows that large scenes need grow with the square
+        # of their resolution; small ones would only learn more slowly with more rows.
+        cells = 2 * finest if is_unbounded else finest
+        rows = round(math.log2(cells**2 * _ROWS_PER_CELL_OF_A_FACE))
+        rows = max(_FEWEST_LOG2_ROWS, min(rows, _MOST_LOG2_ROWS))
+
+        is_coarse = not preset.is_carved or longest_edge > _LARGE_BOX * pixel_size
+        smallest = (
+            preset.first_smallest_weight if renderer.smallest_weight == "auto" else renderer.smallest_weight
+        )
+        return fill_auto(
+            replace(
+                self,
+                num_endmembers=count,
+                field=fill_auto(replace(field, finest_resolution=finest), log2_rows_per_level=rows),
+                renderer=fill_auto(
+                    renderer,
+                    samples_per_pixel=1.0 if is_coarse else 1.5,
+                    coarse_samples=preset.coarse_samples,
+                    smallest_weight=preset.smallest_weight,
+                    first_smallest_weight=smallest,
+                    visible_weight=preset.visible_weight,
+                ),
+                losses=fill_auto(
+                    self.losses,
+                    background=preset.background,
+                    rgb=preset.rgb_loss_weight,
+                    exposure=1.0,
+                    relative=0.0,
+                    band_weights=(),
+                ),
+            ),
+            num_specular_spectra=1 + of_endmembers if self.specular == "dictionary" else 1,
+            light="fixed",
+            lamp=(),
+            initial_opacity=preset.initial_opacity,
+        )
 
 
 def _resolved_losses(

@@ -24,7 +24,7 @@ SMALL = UnmixFieldConfig(temperature=0.4, scale="per-endmember", **SIZES)
 @pytest.fixture
 def field() -> PublishedField:
     torch.manual_seed(0)
-    made = PublishedField(SMALL, FieldSpace(BOX, 2.0, 0.1), 3, NUM_BANDS)
+    made = PublishedField(SMALL, FieldSpace(BOX, 2.0), 3, NUM_BANDS)
     with torch.no_grad():
         made.table.normal_(std=0.5)
     return made

@@ -27,7 +27,9 @@ def make(
 ) -> tuple[VolumeRenderer, UnmixField]:
     """With `depth` every sample has that optical depth."""
     torch.manual_seed(0)
-    field = UnmixField(UnmixFieldConfig(log2_rows_per_level=8), FieldSpace(BOX, 1.0, PIXEL), 3, 1)
+    field = UnmixField(
+        UnmixFieldConfig(finest_resolution=34, log2_rows_per_level=8), FieldSpace(BOX, 1.0), 3, 1
+    )
     cells, step = torch.ones(8, 8, 8) > 0, pixel / 1.5
     if depth is not None:
         nn.init.zeros_(field.table)

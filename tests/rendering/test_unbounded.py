@@ -18,13 +18,13 @@ from unmix_plugin.rendering.grid_upkeep import update_grid
 from unmix_plugin.rendering.renderer import VolumeRenderer
 from unmix_plugin.settings import UnmixFieldConfig
 
-SMALL = UnmixFieldConfig(log2_rows_per_level=8)
+SMALL = UnmixFieldConfig(finest_resolution=34, log2_rows_per_level=8)
 
 
 def make(density: float = 1e-6) -> tuple[VolumeRenderer, UnmixField]:
     """A field that is as dense everywhere."""
     torch.manual_seed(0)
-    field = UnmixField(SMALL, FieldSpace(BOX, density, 0.1, is_unbounded=True), 3, 1)
+    field = UnmixField(SMALL, FieldSpace(BOX, density, is_unbounded=True), 3, 1)
     with torch.no_grad():
         field.table.zero_()
     cells = torch.ones(16, 16, 16)
@@ -143,7 +143,7 @@ def test_a_backdrop_may_stand_still_in_the_picture_and_a_sky_does_not():
     aside = replace(bundle, offsets=torch.full((20, 2), 0.3))
     elsewhere = replace(bundle, origins=bundle.origins + 0.5)
     for is_unbounded in (False, True):
-        field = UnmixField(SMALL, FieldSpace(BOX, 1.0, 0.1, is_unbounded, has_backdrop=True), 3, 1)
+        field = UnmixField(SMALL, FieldSpace(BOX, 1.0, is_unbounded, has_backdrop=True), 3, 1)
         with torch.no_grad():
             here, others = field.sky(bundle), [field.sky(aside), field.sky(elsewhere)]
         assert here is not None
@@ -154,7 +154,7 @@ def test_a_backdrop_may_stand_still_in_the_picture_and_a_sky_does_not():
 
 def test_a_backdrop_brighter_and_darker_than_its_endmember_is_learnt():
     """As the light of a lens falls from the middle to the sides."""
-    field = UnmixField(SMALL, FieldSpace(BOX, 1.0, 0.1, has_backdrop=True), 3, 1)
+    field = UnmixField(SMALL, FieldSpace(BOX, 1.0, has_backdrop=True), 3, 1)
     across = torch.linspace(-0.7, 0.7, 64)
     bundle = replace(rays(64), offsets=torch.stack([across, across], dim=1))
     wanted = 1.3 - 1.2 * across.square()
@@ -172,10 +172,10 @@ def test_a_backdrop_brighter_and_darker_than_its_endmember_is_learnt():
 
 
 def test_a_bounded_field_has_a_sky_behind_all_matter_only_where_there_is_a_backdrop():
-    bare = UnmixField(SMALL, FieldSpace(BOX, 1.0, 0.1), 3, 1)
+    bare = UnmixField(SMALL, FieldSpace(BOX, 1.0), 3, 1)
     assert bare.sky(rays(2)) is None
     assert not [name for name in bare.state_dict() if "sky" in name]
-    field = UnmixField(SMALL, FieldSpace(BOX, 1e-9, 0.1, has_backdrop=True), 3, 1)
+    field = UnmixField(SMALL, FieldSpace(BOX, 1e-9, has_backdrop=True), 3, 1)
     reachable = torch.ones((8, 8, 8), dtype=torch.bool)
     renderer = VolumeRenderer(
         UnitSpace(BOX), torch.zeros((8, 8, 8), dtype=torch.uint8), reachable, 0.05, 1e-3
