@@ -7,7 +7,7 @@ published need are annotated with `Unlisted`: they work as flags, but no help li
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
@@ -17,11 +17,13 @@ from unmix_plugin.engine.configs import (
     CommonFlag,
     DataManagerConfig,
     ModelConfig,
+    Settings,
     Target,
     UnlistedFlag,
+    Within,
     short_flag,
 )
-from unmix_plugin.errors import Check, ConfigError, require
+from unmix_plugin.errors import Check, ConfigError
 from unmix_plugin.presets import Auto, fill_auto, preset_for
 
 if TYPE_CHECKING:
@@ -63,11 +65,6 @@ _WHERE_LAMP = {
 }
 
 
-def _within(value: float | int | str, low: float | int, high: float | int = math.inf) -> bool:
-    """Whether a setting is a word such as `auto`, or a number from `low` to `high`."""
-    return isinstance(value, str) or low <= value <= high
-
-
 @dataclass(frozen=True)
 class SceneOptions:
     """How to read a scene."""
@@ -100,167 +97,109 @@ class HyperspectralDataManagerConfig(DataManagerConfig):
     """Rays of the first training step; the model adapts the number to its budget of samples."""
     scene: SceneOptions = SceneOptions()
     """How the files are read and split."""
-    subpixels: int | Auto = "auto"
+    subpixels: Annotated[int | Auto, Within("[1, 8]")] = "auto"
     """Rays cast through a pixel, along each of its edges; their mean is the pixel, in training and in rendering. Auto
     is 2, but 1 where the training views have more than 4 million pixels: more pixels teach more than exact ones."""
-    single_ray_until: Unlisted[float | Auto] = "auto"
+    single_ray_until: Annotated[Unlisted[float | Auto], Within("[0, 1]")] = "auto"
     """Part of the training in which a pixel has a single ray: coarse shape needs many pixels, not exact ones. Auto is
     0.4 with alpha or before a backdrop, otherwise 0.8."""
-    grid_resolution: Unlisted[int] = 128
+    grid_resolution: Annotated[Unlisted[int], Within("[8, 512]")] = 128
     """Cells along an edge of the occupancy grid, from which space is carved that the views show to be empty."""
     trust_alpha: bool = False
     """Believe alpha even where the light of a pixel contradicts it."""
     mend_values: bool = True
     """Replace stripes and spikes in training views by what is around them: values that stand out from the bands
     beside them and from the pixels around them in that. From 8 bands on, for pixels that memory holds."""
-    memory_gb: float | Auto = "auto"
+    memory_gb: Annotated[float | Auto, Within("[0.01, inf)")] = "auto"
     """GiB of memory for training pixels and for reading them. Auto is most of what the device has left.
     Pixels that need more stay in the scene's files, and a part of them is held that is renewed while training goes
     on."""
 
-    target_components: int | Literal["auto", "none"] = "auto"
+    target_components: Annotated[int | Literal["auto", "none"], Within("[1, inf)")] = "auto"
     """Numbers to keep of each training pixel instead of one a band: its components in the subspace that the scene's
     spectra lie in. Auto is none where all bands fit into the memory for training pixels; otherwise, from 100 bands on,
     as many as leave out no more than noise. What training compares are spectra on all bands in any case."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        rules = [
-            Check("memory_gb", "of at least 0.01 or auto", _within(self.memory_gb, 0.01)),
-            Check("subpixels", "of 1 to 8 or auto", _within(self.subpixels, 1, 8)),
-            Check("single_ray_until", "in [0, 1] or auto", _within(self.single_ray_until, 0, 1)),
-            Check("grid_resolution", "of 8 to 512", _within(self.grid_resolution, 8, 512)),
-            Check("target_components", "of at least 1, auto or none", _within(self.target_components, 1)),
-        ]
-        require("the data manager", self, rules)
-
 
 @dataclass(frozen=True)
-class UnmixFieldConfig:
+class UnmixFieldConfig(Settings):
     """Sizes of the field's grid and networks."""
 
-    num_levels: Unlisted[int] = 8
+    _called = "the field"
+    num_levels: Annotated[Unlisted[int], Within("[1, 32]")] = 8
     """Levels of the hash grid."""
-    features_per_level: Unlisted[int] = 4
+    features_per_level: Annotated[Unlisted[int], Within("[1, 8]")] = 4
     """Features that the hash grid holds at each vertex of a level."""
-    coarsest_resolution: Unlisted[int] = 16
+    coarsest_resolution: Annotated[Unlisted[int], Within("[2, 4096]")] = 16
     """Cells along an edge of the scene box on the coarsest level."""
-    finest_resolution: Unlisted[int | Auto] = "auto"
+    finest_resolution: Annotated[Unlisted[int | Auto], Within("[2, 4096]")] = "auto"
     """The same on the finest level. Auto follows from `cells_per_pixel`."""
-    cells_per_pixel: Annotated[float, AtStartOnly] = 1.7
+    cells_per_pixel: Annotated[float, AtStartOnly, Within("[0.001, 100]")] = 1.7
     """Cells of the finest level along the edge of a pixel where it meets the middle of the scene box: finer ones would
     fit what the views don't show."""
-    log2_rows_per_level: Unlisted[int | Auto] = "auto"
+    log2_rows_per_level: Annotated[Unlisted[int | Auto], Within("[4, 24]")] = "auto"
     """Largest number of vertices that a level stores, as a power of two; finer levels share rows by a hash. auto: from
     16 to 19, about a third of the finest level's cells in a face of the scene box."""
-    hidden_width: Unlisted[int] = 64
+    hidden_width: Annotated[Unlisted[int], Within("[1, 1024]")] = 64
     """Width of the hidden layers."""
-    temperature: float = 1.0
+    temperature: Annotated[float, Within("[0.01, 100]")] = 1.0
     """T of the abundances' softmax: lower is purer."""
     scale: Literal["shared", "per-endmember"] = "shared"
     """One brightness a point, or one a point and endmember, as published."""
 
-    def __post_init__(self) -> None:
-        finest = self.finest_resolution
-        rules = [
-            Check("num_levels", "of 1 to 32", _within(self.num_levels, 1, 32)),
-            Check("features_per_level", "of 1 to 8", _within(self.features_per_level, 1, 8)),
-            Check(
-                "coarsest_resolution",
-                "of 2 to 4096",
-                _within(self.coarsest_resolution, 2, LARGEST_RESOLUTION),
-            ),
-            Check("finest_resolution", "of 2 to 4096 or auto", _within(finest, 2, LARGEST_RESOLUTION)),
-            Check("cells_per_pixel", "of 0.001 to 100", _within(self.cells_per_pixel, 0.001, 100)),
-            Check("log2_rows_per_level", "of 4 to 24 or auto", _within(self.log2_rows_per_level, 4, 24)),
-            Check("hidden_width", "of 1 to 1024", _within(self.hidden_width, 1, 1024)),
-            Check(("temperature",), "a temperature of 0.01 to 100", _within(self.temperature, 0.01, 100)),
-        ]
-        require("the field", self, rules)
-
 
 @dataclass(frozen=True)
-class RendererConfig:
+class RendererConfig(Settings):
     """How finely rays are sampled and what is left out."""
 
-    samples_per_pixel: Annotated[float | Auto, AtStartOnly] = "auto"
+    _called = "the renderer"
+    samples_per_pixel: Annotated[float | Auto, AtStartOnly, Within("[0.01, 100]")] = "auto"
     """Samples of a ray along the length of a pixel's edge where it meets the middle of the scene box. Auto is 1.5, but
     1 where neither alpha nor a backdrop is known, or the box is more than 300 pixels long: more rays teach more."""
-    coarse_samples: Annotated[Unlisted[int | Auto], AtStartOnly] = "auto"
+    coarse_samples: Annotated[Unlisted[int | Auto], AtStartOnly, Within("[1, inf)")] = "auto"
     """Samples along the longest edge of the scene box at the start of training, if there are more in the end: what is
     coarse must be found first, by many rays of few samples. Auto is 256, but 64 in an unbounded world, where rays go
     on outside the box."""
-    smallest_weight: Unlisted[float | Auto] = "auto"
+    smallest_weight: Annotated[Unlisted[float | Auto], Within("[0, 1)")] = "auto"
     """Samples that contribute less than this share of their ray's light are left out. Auto is 0.004."""
-    first_smallest_weight: Unlisted[float | Auto] = "auto"
+    first_smallest_weight: Annotated[Unlisted[float | Auto], Within("[0, 1)")] = "auto"
     """The same at the start of training. Auto is 0.001 where `smallest_weight` is auto and neither alpha nor a backdrop
     is known, else `smallest_weight`."""
-    visible_weight: Unlisted[float | Auto] = "auto"
+    visible_weight: Annotated[Unlisted[float | Auto], Within("(0, 1]")] = "auto"
     """Share of its ray's light from which a sample counts as seen. Cells that no two training views have lately seen
     are left out; 1 leaves none out. Auto is 0.05 with alpha or before a backdrop, else 1."""
 
-    def __post_init__(self) -> None:
-        rules = [
-            Check("samples_per_pixel", "of 0.01 to 100 or auto", _within(self.samples_per_pixel, 0.01, 100)),
-            Check("coarse_samples", "of at least 1 or auto", _within(self.coarse_samples, 1)),
-            Check(
-                "smallest_weight",
-                "in [0, 1) or auto",
-                self.smallest_weight == "auto" or 0 <= self.smallest_weight < 1,
-            ),
-            Check(
-                "first_smallest_weight",
-                "in [0, 1) or auto",
-                self.first_smallest_weight == "auto" or 0 <= self.first_smallest_weight < 1,
-            ),
-            Check(
-                "visible_weight",
-                "in (0, 1] or auto",
-                self.visible_weight == "auto" or 0 < self.visible_weight <= 1,
-            ),
-        ]
-        require("the renderer", self, rules)
-
 
 @dataclass(frozen=True)
-class LossConfig:
+class LossConfig(Settings):
     """What rendered pixels are compared with, and how much each comparison counts."""
 
+    _called = "the loss"
     background: Literal["random", "black", "white", "last"] | Auto = "auto"
     """What lies behind the scene in training: a random grey a ray, black, white, or the colour of the last sample. Auto
     is random where alpha is known, otherwise black."""
-    spectral: Unlisted[float] = 1.0
+    spectral: Annotated[Unlisted[float], Within("[0, inf)")] = 1.0
     """Weight of the mean squared error of spectra."""
-    rgb: float | Auto = "auto"
+    rgb: Annotated[float | Auto, Within("[0, inf)")] = "auto"
     """Weight of the mean squared error of their sRGB colours, in which dark pixels count more. Auto is 0.2 with
     alpha or before a backdrop, otherwise 0: where black may be the void, it costs quality."""
     band_weights: tuple[float, ...] | Auto = "auto"
     """Weight of the squared error in each band of the scene; none are equal weights. Auto gives less to bands that are
     much noisier than the others, or dead: the reciprocal of their noise's variance. The mean is 1."""
-    abundances: float = 0.1
+    abundances: Annotated[float, Within("[0, inf)")] = 0.1
     """Weight of the mean squared distance of composited abundances to those of the measured spectra, unmixed one by
     one with the first endmembers; 0 as published. It falls to a tenth of that at the end of training."""
-    exposure: Annotated[Unlisted[float | Auto], AtStartOnly] = "auto"
+    exposure: Annotated[Unlisted[float | Auto], AtStartOnly, Within("(0, inf)")] = "auto"
     """Factor on spectra, rendered and measured, before they are compared: errors of dark scenes count as much as those
     of bright ones. Auto makes the median opaque pixel as bright as 0.2, but darkens nothing."""
-    relative: Unlisted[float | Auto] = "auto"
+    relative: Annotated[Unlisted[float | Auto], Within("[0, 2]")] = "auto"
     """Power of a pixel's brightness by which squared errors of its spectrum are divided: 0 for absolute errors, 2 for
     relative ones. Auto is 0 unless alpha is known and the brighter pixels are much brighter than the others."""
 
-    def __post_init__(self) -> None:
-        rules = [
-            Check("spectral", "of at least 0", _within(self.spectral, 0)),
-            Check("rgb", "of at least 0", _within(self.rgb, 0)),
-            Check("abundances", "of at least 0", _within(self.abundances, 0)),
-            Check(
-                "band_weights",
-                "above 0, auto or none",
-                self.band_weights == "auto" or all(weight > 0 for weight in self.band_weights),
-            ),
-            Check(("exposure",), "an exposure above 0 or auto", self.exposure == "auto" or self.exposure > 0),
-            Check("relative", "in [0, 2] or auto", _within(self.relative, 0, 2)),
-        ]
-        require("the losses", self, rules)
+    def rules(self) -> Sequence[Check]:
+        """Weights of bands that count."""
+        are_weights = self.band_weights == "auto" or all(weight > 0 for weight in self.band_weights)
+        return (Check("band_weights", "above 0, auto or none", are_weights),)
 
 
 @dataclass(frozen=True)
@@ -283,7 +222,9 @@ class UnmixModelConfig(ModelConfig):
     """Settings of the model of UnMix-NeRF."""
 
     _target: Target = "unmix_plugin.model:UnmixModel"
-    num_endmembers: Annotated[int | Auto | None, CommonFlag, short_flag("endmembers")] = None
+    num_endmembers: Annotated[int | Auto | None, CommonFlag, short_flag("endmembers"), Within("[1, 255]")] = (
+        None
+    )
     """K, the number of materials to unmix into; auto proposes it from the training pixels. None is 6, or the number of
     bands if that is smaller."""
     endmember_init: Annotated[EndmemberInit, CommonFlag, AtStartOnly, short_flag("endmember-init")] = "pairs"
@@ -293,7 +234,7 @@ class UnmixModelConfig(ModelConfig):
     and by one factor for the scene's brightness."""
     specular: Literal["none", "dictionary", "full"] = "dictionary"
     """View-dependent part: none, multiples of a few spectra, or one value a band as published."""
-    num_specular_spectra: Unlisted[int | Auto] = "auto"
+    num_specular_spectra: Annotated[Unlisted[int | Auto], Within("[1, 256]")] = "auto"
     """Spectra of the specular dictionary. The first is the light's, a highlight's colour on anything but metal; then
     come the endmembers', as light that they send on has. Auto is 1 with alpha or before a
     backdrop, else all."""
@@ -314,10 +255,10 @@ class UnmixModelConfig(ModelConfig):
     """How poses are corrected."""
     segmentation: Literal["abundances", "probe"] = "abundances"
     """Material of a ray: its largest abundance, or the endmember of smallest angle to its spectrum as published."""
-    samples_per_step: int | Auto = "auto"
+    samples_per_step: Annotated[int | Auto, Within("[1, 100000000]")] = "auto"
     """Samples of rays that a training step looks at; the number of rays adapts to it. Auto is 25,000 on a CPU and
     400,000 on a GPU, which takes no longer for them."""
-    initial_opacity: Annotated[Unlisted[float | Auto], AtStartOnly] = "auto"
+    initial_opacity: Annotated[Unlisted[float | Auto], AtStartOnly, Within("(0, 1)")] = "auto"
     """Opacity of one sample's interval in the untrained field. Auto is 0.05 with alpha or before a backdrop, else
     0.01: space between cameras and walls must stay clear."""
     as_published: Unlisted[bool] = False
@@ -329,21 +270,13 @@ class UnmixModelConfig(ModelConfig):
     losses: LossConfig = LossConfig()
     """What training asks for, and how strongly."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        count, opacity, ours = self.num_endmembers, self.initial_opacity, not self.as_published
+    def rules(self) -> Sequence[Check]:
+        """What belongs together: a lamp and light that moves, endmembers and their file, and what is as published."""
+        ours = not self.as_published
         has_lamp, has_file = self.lamp not in ("auto", ()), self.endmember_file is not None
         is_lamp = len(self.lamp) == _LAMP_NUMBERS and self.lamp[0] in (0, 1)
         is_lamp = is_lamp and all(any(self.lamp[first : first + 3]) for first in (4, 7))
-        rules = [
-            Check("num_endmembers", "of 1 to 255 or auto", count is None or _within(count, 1, 255)),
-            Check("num_specular_spectra", "of 1 to 256 or auto", _within(self.num_specular_spectra, 1, 256)),
-            Check(
-                "samples_per_step",
-                "of 1 to 100 million or auto",
-                _within(self.samples_per_step, 1, 100_000_000),
-            ),
-            Check("initial_opacity", "in (0, 1) or auto", opacity == "auto" or 0 < opacity < 1),
+        return (
             Check(
                 ("lamp",),
                 "a lamp of no or ten numbers, the first 0 or 1, axis and way not 0, or auto",
@@ -369,8 +302,7 @@ class UnmixModelConfig(ModelConfig):
                 "endmember-file exactly when endmember-init is file",
                 (self.endmember_init == "file") == has_file,
             ),
-        ]
-        require("the model", self, rules)
+        )
 
     def resolve_auto(
         self, initial_data: Callable[[], Mapping[str, np.ndarray]], generator: torch.Generator

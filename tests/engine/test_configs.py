@@ -3,11 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated
+from typing import Annotated, Literal
 
 import pytest
 
-from unmix_plugin.engine.configs import CommonFlag, InstantiateConfig, Setting, map_settings, settings_of
+from unmix_plugin.engine.configs import (
+    CommonFlag,
+    InstantiateConfig,
+    Setting,
+    Settings,
+    Within,
+    map_settings,
+    settings_of,
+)
 from unmix_plugin.errors import ConfigError
 
 
@@ -49,3 +57,45 @@ def test_annotations_change_in_classes_that_are_made_for_them_and_values_stay():
         (("inner", "width"), 7, ("seen",)),
     ]
     assert type(marked)().inner.width == 7  # what is shown as default
+
+
+@dataclass(frozen=True)
+class Bounded(Settings):
+    rate: Annotated[float | Literal["auto"], Within("(0, 1]")] = "auto"
+    steps: Annotated[int | None, Within("[1, 9]")] = None
+    factor: Annotated[float, CommonFlag, Within("(0, inf)")] = 1.0
+    count: Annotated[int, Within("[0, inf)")] = 0
+
+
+@dataclass(frozen=True)
+class Refined(Bounded):
+    steps: int | None = 4
+
+
+@pytest.mark.parametrize("kind", [Bounded, Refined])
+@pytest.mark.parametrize(
+    ("values", "rule"),
+    [
+        ({"rate": 0.0}, r"rate in \(0, 1\] or auto \(got 0.0\)$"),
+        ({"rate": 1.01}, "rate in"),
+        ({"steps": 0}, r"steps of 1 to 9 \(got 0\)$"),
+        ({"steps": 10}, "steps of 1 to 9"),
+        ({"factor": 0.0}, r"factor above 0 and finite \(got 0.0\)$"),
+        ({"factor": float("inf")}, "factor above 0 and finite"),
+        ({"factor": float("nan")}, "factor above 0 and finite"),
+        ({"count": -1}, r"count of at least 0 \(got -1\)$"),
+        ({"steps": 0, "count": -1}, r"steps of 1 to 9 \(got 0\) and count of at least 0"),
+    ],
+)
+def test_a_number_outside_its_interval_is_refused_also_of_a_class_with_another_default(kind, values, rule):
+    with pytest.raises(ConfigError, match=rule):
+        kind(**values)
+
+
+def test_ends_of_intervals_words_and_none_are_taken():
+    assert [Bounded(rate=1.0).rate, Bounded(rate="auto").rate, Bounded(steps=None).steps] == [
+        1.0,
+        "auto",
+        None,
+    ]
+    assert [Bounded(steps=count).steps for count in (1, 9)] == [1, 9]

@@ -124,10 +124,10 @@ def test_abundances_are_drawn_to_those_that_measured_spectra_show_and_let_go_as_
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"rgb": -1.0}, r"rgb of at least 0 \(got -1.0\)$"),
-        ({"exposure": 0.0}, r"an exposure above 0 or auto"),
-        ({"relative": -0.5}, r"relative in \[0, 2\] or auto"),
-        ({"relative": 2.5}, r"relative in \[0, 2\] or auto"),
+        ({"rgb": -1.0}, r"rgb of at least 0 and finite or auto \(got -1.0\)$"),
+        ({"exposure": 0.0}, r"exposure above 0 and finite or auto"),
+        ({"relative": -0.5}, r"relative of 0 to 2 or auto"),
+        ({"relative": 2.5}, r"relative of 0 to 2 or auto"),
     ],
 )
 def test_impossible_losses_are_refused(settings, message):

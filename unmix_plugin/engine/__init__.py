@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from unmix_plugin.engine.configs import PipelineConfig as PipelineConfig
     from unmix_plugin.engine.configs import Target as Target
     from unmix_plugin.engine.configs import TrainerConfig as TrainerConfig
+    from unmix_plugin.engine.configs import Within as Within
     from unmix_plugin.engine.configs import short_flag as short_flag
     from unmix_plugin.engine.decisions import UNDECIDED as UNDECIDED
     from unmix_plugin.engine.decisions import Decision as Decision
@@ -58,6 +59,7 @@ _MODULES = {
         "PipelineConfig",
         "Target",
         "TrainerConfig",
+        "Within",
         "short_flag",
     ),
     "decisions": ("UNDECIDED", "Decision"),

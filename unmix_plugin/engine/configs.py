@@ -8,12 +8,13 @@ so that the help of a command is quick.
 from __future__ import annotations
 
 import inspect
-import math
-from collections.abc import Callable, Iterator, Mapping
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, make_dataclass, replace
+from functools import cache
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, get_args, get_origin, get_type_hints
 
 import tyro
 
@@ -44,7 +45,73 @@ def short_flag(name: str) -> Any:
 
 
 @dataclass(frozen=True)
-class InstantiateConfig:
+class Within:
+    """Annotation of a number that must lie in an interval, as in `Annotated[float | Auto, Within("(0, 1]")]`; words
+    such as `auto`, and None, may stand in its place."""
+
+    interval: str
+    """Its ends; a round bracket beside an end that is left out. No number is infinite."""
+
+    def holds(self, value: Any) -> bool:
+        """Whether a value of that type keeps it."""
+        if value is None or isinstance(value, str):
+            return True
+        low, high = map(float, self.interval[1:-1].split(","))
+        above = low < value if self.interval[0] == "(" else low <= value
+        return above and (value < high if self.interval[-1] == ")" else value <= high)
+
+    def rule(self, hint: Any) -> str:
+        """The interval in words, and what else a setting of this type may be."""
+        (first, low, high, last), kinds = re.findall(r"[\[(\])]|[^\[(\]), ]+", self.interval), get_args(hint)
+        words = f"of {low} to {high}" if first + last == "[]" else f"in {self.interval}"
+        if high == "inf":
+            words = f"above {low}" if first == "(" else f"of at least {low}"
+            words += " and finite" if float in (hint, *kinds) else ""
+        choices = [choice for kind in kinds if get_origin(kind) is Literal for choice in get_args(kind)]
+        return " or ".join([words, *choices])
+
+
+@cache
+def type_hints(kind: type) -> dict[str, Any]:
+    """Types of a config's fields with their annotations."""
+    return get_type_hints(kind, include_extras=True)
+
+
+@cache
+def _intervals(kind: type) -> dict[str, tuple[Within, str]]:
+    """By name: the fields of a config that must lie in an interval, and the rule in words; a class that gives a field
+    another default keeps it."""
+    found = {}
+    for base in reversed(kind.__mro__):
+        for name, hint in type_hints(base).items():
+            for mark in getattr(hint, "__metadata__", ()):
+                if isinstance(mark, Within):
+                    found[name] = mark, mark.rule(get_args(hint)[0])
+    return found
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Base of all configs, which are checked when they are made."""
+
+    _called: ClassVar[str] = "a part of the settings"
+    """In messages."""
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that are not `Within` their intervals, and broken `rules`, all by one `ConfigError`."""
+        intervals = [
+            Check(name, rule, interval.holds(getattr(self, name)))
+            for name, (interval, rule) in _intervals(type(self)).items()
+        ]
+        require(self._called, self, [*intervals, *self.rules()])
+
+    def rules(self) -> Sequence[Check]:
+        """What else must hold; a subclass adds to those of its base."""
+        return ()
+
+
+@dataclass(frozen=True)
+class InstantiateConfig(Settings):
     """Settings of one object, and the class that takes them."""
 
     _target: Target = object
@@ -79,12 +146,6 @@ def place_of(kind: type) -> str:
     return f"{kind.__module__}.{kind.__qualname__}{place}"
 
 
-def require_in_range(name: str, value: int | float, low: int | float, high: int | float) -> None:
-    """Refuse a setting outside [low, high]. Raises ConfigError: it is outside, or not a number."""
-    if not low <= value <= high:
-        raise ConfigError(f"{name} must be from {low} to {high}; got {value}")
-
-
 MOST_PROCESSES = 1024
 """That train one model together."""
 
@@ -93,23 +154,16 @@ DeviceName = Literal["auto", "cpu", "cuda"]
 
 
 @dataclass(frozen=True)
-class OptimizerConfig:
+class OptimizerConfig(Settings):
     """Adam for one group of parameters, and its learning-rate schedule."""
 
-    lr: float = 1e-2
+    _called = "an optimizer"
+    lr: Annotated[float, Within("(0, inf)")] = 1e-2
     """Step size at the start of training."""
-    final_factor: float = 0.1
+    final_factor: Annotated[float, Within("(0, 1]")] = 0.1
     """Step size at the end of training as a part of `lr`; between, it falls by equal factors. 1 keeps it constant."""
-    weight_decay: float = 0.0
+    weight_decay: Annotated[float, Within("[0, inf)")] = 0.0
     """Times the parameters, added to their gradient: draws what the data leaves open to 0."""
-
-    def __post_init__(self) -> None:
-        rules = [
-            Check("lr", "above 0 and finite", 0 < self.lr < math.inf),
-            Check("final_factor", "in (0, 1]", 0 < self.final_factor <= 1),
-            Check("weight_decay", "of at least 0 and finite", 0 <= self.weight_decay < math.inf),
-        ]
-        require("an optimizer", self, rules)
 
 
 @dataclass(frozen=True)
@@ -117,12 +171,9 @@ class DataManagerConfig(InstantiateConfig):
     """Settings that every data manager has."""
 
     _target: Target = "unmix_plugin.engine.model:DataManager"
-    train_num_rays_per_batch: int = 4096
+    _called = "the data manager"
+    train_num_rays_per_batch: Annotated[int, Within("[1, 4194304]")] = 4096
     """Rays of the first training step; a model may adapt the number later."""
-
-    def __post_init__(self) -> None:
-        """Refuse a number out of its range by `ConfigError`; a subclass with rules of its own calls this too."""
-        require_in_range("train_num_rays_per_batch", self.train_num_rays_per_batch, 1, 2**22)
 
 
 @dataclass(frozen=True)
@@ -130,13 +181,9 @@ class ModelConfig(InstantiateConfig):
     """Settings that every model has."""
 
     _target: Target = "unmix_plugin.engine.model:Model"
-    eval_num_rays_per_chunk: int | Literal["auto"] = "auto"
+    _called = "the model"
+    eval_num_rays_per_chunk: Annotated[int | Literal["auto"], Within("[256, 4194304]")] = "auto"
     """Rays rendered at once for a whole image; fewer take less memory. Auto is 32,768 on a CPU, 131,072 on a GPU."""
-
-    def __post_init__(self) -> None:
-        """Refuse a number out of its range by `ConfigError`; a subclass with rules of its own calls this too."""
-        if self.eval_num_rays_per_chunk != "auto":
-            require_in_range("eval_num_rays_per_chunk", self.eval_num_rays_per_chunk, 256, 2**22)
 
     def resolve_auto(
         self, initial_data: Callable[[], Mapping[str, np.ndarray]], generator: torch.Generator
@@ -161,44 +208,43 @@ class PipelineConfig(InstantiateConfig):
 
 
 @dataclass(frozen=True)
-class MachineConfig:
+class MachineConfig(Settings):
     """On what to train."""
 
-    num_devices: int = 1
+    _called = "a machine"
+    num_devices: Annotated[int, Within(f"[1, {MOST_PROCESSES}]")] = 1
     """Processes that share the rays of each step, on CUDA each on a device of its own, on the CPU each with a part of
     the cores. Several machines: start them with torchrun, which says how many there are."""
 
-    def __post_init__(self) -> None:
-        require_in_range("machine.num_devices", self.num_devices, 1, MOST_PROCESSES)
-
 
 @dataclass(frozen=True)
-class TrainerConfig:
+class TrainerConfig(Settings):
     """Settings of one training run; `Trainer(config)` runs it."""
 
+    _called = "a training"
     method_name: tyro.conf.Suppress[str] = "unnamed"
     """Name under which the method is registered."""
     data: Annotated[Path | None, CommonFlag] = None
     """The scene's folder."""
     output_dir: Annotated[Path, CommonFlag, AtStartOnly] = Path("outputs")
     """Folder under which the run's own folder is made."""
-    max_num_iterations: Annotated[int | None, CommonFlag] = 20_000
+    max_num_iterations: Annotated[int | None, CommonFlag, Within("[0, inf)")] = 20_000
     """Training ends after so many steps (None: no such limit)."""
-    max_seconds: Annotated[float | None, CommonFlag] = None
+    max_seconds: Annotated[float | None, CommonFlag, Within("(0, inf)")] = None
     """Training ends after so many seconds of training; reading, compiling, evaluating and saving not counted."""
     seed: Annotated[int, CommonFlag] = 42
     """Everything random follows from this."""
     device: Annotated[DeviceName, CommonFlag] = "auto"
     """Where to compute; auto takes CUDA where there is one."""
-    steps_per_save: int = 1000
+    steps_per_save: Annotated[int, Within("[0, inf)")] = 1000
     """Save a checkpoint every so many steps; 0: only at the end."""
-    steps_per_eval_all_images: int = 0
+    steps_per_eval_all_images: Annotated[int, Within("[0, inf)")] = 0
     """Evaluate all evaluation views every so many steps; 0: never."""
-    steps_per_log: int = 50
+    steps_per_log: Annotated[int, Within("[1, inf)")] = 50
     """Write losses and metrics to metrics.jsonl every so many steps."""
-    checkpoints_kept: int = 2
+    checkpoints_kept: Annotated[int, Within("[1, inf)")] = 2
     """How many of the newest checkpoints stay in the run folder."""
-    average_decay: tyro.conf.Suppress[float | None] = None
+    average_decay: Annotated[tyro.conf.Suppress[float | None], Within("[0, 1)")] = None
     """Decay a step of the moving average of the parameters with which the run is evaluated and rendered; early in
     training it decays faster, to span at most about a ninth of the steps so far. None: no average."""
     load_run: Annotated[Path | None, CommonFlag] = None
@@ -210,36 +256,21 @@ class TrainerConfig:
     optimizers: tyro.conf.Suppress[Mapping[str, OptimizerConfig]] = field(default_factory=dict)
     """Settings of the optimiser by parameter group."""
 
-    def __post_init__(self) -> None:
-        rules = [
-            Check(
-                "max_num_iterations",
-                "of at least 0",
-                self.max_num_iterations is None or self.max_num_iterations >= 0,
-            ),
-            Check(
-                "max_seconds",
-                "above 0 and finite",
-                self.max_seconds is None or 0 < self.max_seconds < math.inf,
-            ),
+    def rules(self) -> Sequence[Check]:
+        """A limit, a seed that torch takes, and a name that a folder can have."""
+        return (
             Check(
                 ("max_num_iterations", "max_seconds"),
                 "max-num-iterations or max-seconds",
                 (self.max_num_iterations, self.max_seconds) != (None, None),
             ),
             Check("seed", "of -2^63 to 2^63 - 1", -(2**63) <= self.seed < 2**63),
-            Check("steps_per_save", "of at least 0", self.steps_per_save >= 0),
-            Check("steps_per_eval_all_images", "of at least 0", self.steps_per_eval_all_images >= 0),
-            Check("steps_per_log", "of at least 1", self.steps_per_log >= 1),
-            Check("checkpoints_kept", "of at least 1", self.checkpoints_kept >= 1),
-            Check("average_decay", "in [0, 1)", self.average_decay is None or 0 <= self.average_decay < 1),
             Check(
                 ("method_name",),
                 "a file name as method-name",
                 bool(self.method_name) and "/" not in self.method_name,
             ),
-        ]
-        require("a training", self, rules)
+        )
 
     def progress(self, steps: int, seconds: float) -> float:
         """Fraction in [0, 1] that so many steps and seconds of training are of the limit that is nearer its end."""
@@ -271,7 +302,7 @@ class Setting:
 
 def settings_of(config: Any, path: tuple[str, ...] = ()) -> Iterator[Setting]:
     """All settings in a tree of configs, in their order; not those that begin with `_`, which say what is set up."""
-    hints = get_type_hints(type(config), include_extras=True)
+    hints = type_hints(type(config))
     for entry in fields(config):
         value, here = getattr(config, entry.name), (*path, entry.name)
         if is_dataclass(value) and not isinstance(value, type):
@@ -286,7 +317,7 @@ def map_settings(config: Any, change: Callable[[Setting], Setting], path: tuple[
     A config whose annotations change becomes one of a subclass that has these, for the help of a command.
     """
     values: dict[str, Any] = {}
-    hints = get_type_hints(type(config), include_extras=True)
+    hints = type_hints(type(config))
     changed_hints: dict[str, Any] = {}
     for entry in fields(config):
         value, here, hint = getattr(config, entry.name), (*path, entry.name), hints[entry.name]

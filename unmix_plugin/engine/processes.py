@@ -29,7 +29,7 @@ import torch
 from torch import Tensor, distributed, nn
 
 from unmix_plugin.engine.children import child_command
-from unmix_plugin.engine.configs import MOST_PROCESSES, require_in_range
+from unmix_plugin.engine.configs import MOST_PROCESSES, MachineConfig
 from unmix_plugin.engine.machine import handled_signals
 from unmix_plugin.engine.runs.config_json import flattened
 from unmix_plugin.errors import ConfigError, RunError, UnmixError
@@ -421,7 +421,7 @@ def start_together(module: str, argv: Sequence[str], count: int) -> None:
         RunError: a process was killed; by then all have ended.
         SystemExit: the processes have ended; their exit code.
     """
-    require_in_range("num-devices", count, 1, MOST_PROCESSES)
+    MachineConfig(count)  # which refuses too many
     if count > 1 and _started() is None:
         sys.exit(_run_processes(module, argv, count))
 

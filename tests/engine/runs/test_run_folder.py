@@ -113,7 +113,7 @@ def test_another_version_is_refused_with_what_to_do(trained, name, version, mess
             "many",
             r"config\.pipeline\.model\.num_samples_per_ray: expected int, found 'many'",
         ),
-        ("eval_num_rays_per_chunk", -1, "eval_num_rays_per_chunk must be from 256"),
+        ("eval_num_rays_per_chunk", -1, "eval-num-rays-per-chunk of 256 to 4194304 or auto"),
     ],
 )
 def test_a_config_that_does_not_fit_its_method_is_refused(trained, name, value, words):

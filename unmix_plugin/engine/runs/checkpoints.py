@@ -12,14 +12,14 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import safetensors.torch
+from msgspec import Meta
 from safetensors import SafetensorError
 from torch import Tensor, nn
 
-from unmix_plugin.engine.configs import require_in_range
 from unmix_plugin.engine.runs.atomic_files import whole_file
 from unmix_plugin.engine.runs.replacing import (
     hash_of,
@@ -183,31 +183,29 @@ def _remove(record_path: Path, tensors_path: Path) -> None:
             move_aside(other, "damaged")
 
 
+_Count = Annotated[int, Meta(ge=0, le=2**62)]
+
+
 @dataclass(frozen=True)
 class TrainingRecord:
     """What a checkpoint says in JSON beside its tensors; at the end of training, `training.json`."""
 
-    steps: int
+    steps: _Count
     """Training steps done."""
-    train_seconds: float
+    train_seconds: Annotated[float, Meta(ge=0)]
     """Seconds of training alone."""
-    total_rays: int
+    total_rays: _Count
     """Rays of all training steps."""
-    skipped_steps: int
+    skipped_steps: _Count
     """Steps without an update, since loss or gradient was not finite."""
-    num_rays: int
+    num_rays: Annotated[int, Meta(ge=1, le=2**30)]
     """Rays of the next step."""
-    average_updates: int
+    average_updates: _Count
     """Updates of the average of the parameters."""
     progress: float
     """Fraction of the training done, [0, 1]."""
     learning_rates: dict[str, float]
     """Learning rates of the last step, by parameter group."""
-
-    def __post_init__(self) -> None:
-        for name in ("steps", "train_seconds", "total_rays", "skipped_steps", "average_updates"):
-            require_in_range(name, getattr(self, name), 0, 2**62)
-        require_in_range("num_rays", self.num_rays, 1, 2**30)
 
     @property
     def train_rays_per_second(self) -> float:

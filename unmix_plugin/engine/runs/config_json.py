@@ -8,16 +8,15 @@ import dataclasses
 import math
 import types
 from collections.abc import Mapping
-from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 import msgspec
 
+from unmix_plugin.engine.configs import type_hints
 from unmix_plugin.errors import ConfigError
 
 ConfigT = TypeVar("ConfigT")
-_type_hints = cache(get_type_hints)
 
 
 def config_to_json(value: Any) -> Any:
@@ -84,7 +83,7 @@ def config_from_json(values: Any, default: ConfigT, where: str = "config") -> Co
     """
     if not isinstance(values, dict):
         raise ConfigError(f"{where}: expected an object, found {values!r:.60}")
-    hints = {name: hint for name, hint in _type_hints(type(default)).items() if not name.startswith("_")}
+    hints = {name: hint for name, hint in type_hints(type(default)).items() if not name.startswith("_")}
     if unknown := sorted(values.keys() - hints.keys()):
         raise ConfigError(f"{where}: {type(default).__name__} has no field {', '.join(unknown)}")
     changes = {

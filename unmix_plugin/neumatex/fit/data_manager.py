@@ -28,10 +28,11 @@ from unmix_plugin.engine import (
     SceneBox,
     Target,
     TrainingCallback,
+    Within,
     short_flag,
     step_generator,
 )
-from unmix_plugin.errors import Check, SceneError, require
+from unmix_plugin.errors import SceneError
 from unmix_plugin.formats.files import numbered_apart
 from unmix_plugin.neumatex.fit.object_scene import HeldOutLight, ObjectScene, PosedObject, load_object
 from unmix_plugin.neumatex.fit.settings import ObjectRecord
@@ -64,7 +65,7 @@ class ObjectDataManagerConfig(DataManagerConfig):
     _target: Target = field(default_factory=lambda: ObjectDataManager)
     train_num_rays_per_batch: int = 4096
     """Pixels of a training step, drawn from all training views where they show the mesh."""
-    max_pixels: int = 8_000_000
+    max_pixels: Annotated[int, Within("[1, inf)")] = 8_000_000
     """Training pixels kept in memory; of more, these are drawn evenly."""
     lamp: Annotated[str | None, CommonFlag] = None
     """For pictures of many bands: spectrum of the light, a .csv (wavelength,power), an ENVI spectral library or a name
@@ -74,20 +75,10 @@ class ObjectDataManagerConfig(DataManagerConfig):
     """Mesh in place of that of the data, or of --from-run."""
     environment: Annotated[Path | None, CommonFlag, AtStartOnly, short_flag("environment")] = None
     """Environment map in place of that of the data, or of --from-run; it is neither turned nor scaled."""
-    mesh_triangles: Annotated[int, CommonFlag, AtStartOnly, short_flag("mesh-triangles")] = 20_000
+    mesh_triangles: Annotated[
+        int, CommonFlag, AtStartOnly, short_flag("mesh-triangles"), Within("[100, 1000000]")
+    ] = 20_000
     """Of the mesh that is made of a --from-run, at most."""
-
-    def __post_init__(self) -> None:
-        """Refuse impossible settings."""
-        super().__post_init__()
-        require(
-            "the data manager",
-            self,
-            [
-                Check("max_pixels", "of at least 1", self.max_pixels >= 1),
-                Check("mesh_triangles", "of 100 to 1000000", 100 <= self.mesh_triangles <= 1_000_000),
-            ],
-        )
 
 
 class ObjectDataManager(DataManager):

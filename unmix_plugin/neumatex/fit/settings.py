@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -11,8 +11,16 @@ import numpy as np
 import torch
 import tyro
 
-from unmix_plugin.engine import AtStartOnly, CommonFlag, ModelConfig, Target, config_from_json, short_flag
-from unmix_plugin.errors import Check, require
+from unmix_plugin.engine import (
+    AtStartOnly,
+    CommonFlag,
+    ModelConfig,
+    Target,
+    Within,
+    config_from_json,
+    short_flag,
+)
+from unmix_plugin.errors import Check
 from unmix_plugin.neumatex.fit.tone import LightCurve, ToneMapping
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.unmixing.endmembers import EndmemberMethod
@@ -111,7 +119,9 @@ class NeumatexModelConfig(ModelConfig):
     """Family of materials: neural (base colour and latents of a shared decoder), pbr (base colour, roughness,
     metallicity), or for pictures of many bands spectral (a mixture of endmember reflectances under a grey specular
     layer). Auto is spectral for pictures of many bands, otherwise neural."""
-    num_endmembers: Annotated[int | Auto | None, CommonFlag, short_flag("endmembers")] = None
+    num_endmembers: Annotated[int | Auto | None, CommonFlag, short_flag("endmembers"), Within("[1, 64]")] = (
+        None
+    )
     """Of spectral materials: K, how many reflectances are mixed; auto proposes it from the training pixels. None is the
     number of --pipeline.model.from-run, otherwise 6, or the number of bands if that is smaller."""
     endmember_init: Annotated[EndmemberMethod, AtStartOnly] = "pairs"
@@ -119,14 +129,14 @@ class NeumatexModelConfig(ModelConfig):
     from_run: Annotated[Path | None, CommonFlag, AtStartOnly, short_flag("from-run")] = None
     """Of spectral materials: run of unmix-nerf whose endmembers and abundances the fit starts from. Without --data its
     mesh, cameras and pictures are those of the run, too."""
-    samples: Annotated[int, CommonFlag] = 16
+    samples: Annotated[int, CommonFlag, Within("[2, 1024]")] = 16
     """Paths a pixel in training, in two independent halves; more is slower and less noisy. Few leave a bias, since tone
     curves bend: at equal time, 16 in half as many pixels did better than 8, and 4 in twice as many worse."""
-    bounces: Annotated[int, CommonFlag] = 1
+    bounces: Annotated[int, CommonFlag, Within("[0, 8]")] = 1
     """How often light may be reflected between parts of the object before it reaches the point that is seen."""
-    render_samples: Annotated[int, CommonFlag] = 64
+    render_samples: Annotated[int, CommonFlag, Within("[1, 65536]")] = 64
     """Paths a pixel in renders and in the viewer."""
-    eval_samples: Annotated[int, CommonFlag] = 256
+    eval_samples: Annotated[int, CommonFlag, Within("[1, 65536]")] = 256
     """Paths a pixel in evaluation, where noise would count as an error of the material: with 64 a good fit measures
     1.4 dB worse than it is, with 256 0.2 dB."""
     prior: Annotated[PriorName, CommonFlag] = "small"
@@ -134,34 +144,20 @@ class NeumatexModelConfig(ModelConfig):
     material. Spectral materials have no prior: they start from the pictures or from a run."""
     fit_networks: bool = True
     """Fit the networks that read the planes, too. Published with a prior: the planes alone."""
-    regularisation: float = 1e-5
+    regularisation: Annotated[float, Within("[0, inf)")] = 1e-5
     """Weight of the distance from the prior, over its expected squared error. Less than the squared error of a fitted
     pixel: what the prior has wrong it has wrong in whole regions, so that many of its points count as few."""
-    plane_resolution: int = 128
+    plane_resolution: Annotated[int, Within("[2, 2048]")] = 128
     """Texels along an edge of each of the three planes."""
     light_curve: LightCurve | Auto = "auto"
     """Tone curve through which pictures of linear light are compared in training; others are compared as they are. Auto
     is agx for colours; for bands light over the lamp's power, its logarithm above 1, so that dim bands count too."""
 
-    def __post_init__(self) -> None:
-        """Refuse impossible settings."""
-        super().__post_init__()
-        count = self.num_endmembers
-        rules = [
-            Check("samples", "of 2 to 1024", 2 <= self.samples <= 1024),
-            Check("bounces", "of 0 to 8", 0 <= self.bounces <= 8),
-            Check("render_samples", "of 1 to 65536", 1 <= self.render_samples <= 65536),
-            Check("eval_samples", "of 1 to 65536", 1 <= self.eval_samples <= 65536),
-            Check("regularisation", "of at least 0", 0 <= self.regularisation < float("inf")),
-            Check("plane_resolution", "of 2 to 2048", 2 <= self.plane_resolution <= 2048),
-            Check("num_endmembers", "of 1 to 64 or auto", count in (None, "auto") or 1 <= int(count) <= 64),
-            Check(
-                ("material", "from_run"),
-                "from-run with the material spectral only",
-                self.from_run is None or self.material in ("spectral", "auto"),
-            ),
-        ]
-        require("the model", self, rules)
+    def rules(self) -> Sequence[Check]:
+        """A run to start from is one of mixed spectra."""
+        is_spectral = self.material in ("spectral", "auto")
+        rule = "from-run with the material spectral only"
+        return (Check(("material", "from_run"), rule, self.from_run is None or is_spectral),)
 
     def resolve_auto(
         self, initial_data: Callable[[], Mapping[str, np.ndarray]], generator: torch.Generator
