@@ -351,7 +351,7 @@ def judge_floors(folder: Path, floors: Sequence[tuple[str, np.ndarray]]) -> Iter
     folder.mkdir(parents=True, exist_ok=True)
     for name, texture in floors:
         views, findings = _floor_views(folder, texture), list[str]()
-        check_matches(MatchedScene.of([path.stem for _, path in views], views), findings)
+        check_matches(MatchedScene.of(views), findings)
         outcome = "do not fit" if findings else "no finding"
         yield _row(f"floor, {name}", "patterns that repeat", "matches", outcome, "no finding")
 

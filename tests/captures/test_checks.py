@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
+from tests.factories.captures import record_of
 from tests.factories.files import present
 from tests.factories.scenes import look_at
 from unmix_plugin.captures.checks import SeenView, check_views
@@ -18,7 +19,7 @@ from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet
 from unmix_plugin.captures.report import Code, Kind, report_text, sentences
 from unmix_plugin.captures.writing.scene_files import OUTLINE, contact_sheet
-from unmix_plugin.captures.writing.view_files import ViewRecord, detail_of
+from unmix_plugin.captures.writing.view_files import detail_of
 from unmix_plugin.spectral.colour.srgb import encode_srgb
 
 LAMP = np.array([2.0, 1.0, 5.0])
@@ -134,15 +135,6 @@ def test_detail_falls_when_a_picture_is_blurred():
 
 SIDE = 120
 LENS = Lens(SIDE, SIDE, (150.0, 150.0), (SIDE / 2, SIDE / 2))
-
-
-def record_of(name: str, **facts: float) -> ViewRecord:
-    """A record of a view in which nothing is wrong, but for the facts."""
-    values = {
-        "num_pixels": SIDE * SIDE, "saturated_pixels": 0, "clipped_values": 0, "negative_values": 0,
-        "missing_pixels": 0, "matter_share": 0.5, "specks": 0, "holes": 0, "brightness": 0.5, "detail": 1.0,
-    }  # fmt: skip
-    return ViewRecord(name=name, sensor="", paths={}, mean_spectrum=[], **{**values, **facts})  # type: ignore[arg-type]
 
 
 def ring_of(count: int, span_deg: float = 360.0, elevations_deg=(10.0, 35.0)) -> list[np.ndarray]:

@@ -13,6 +13,7 @@ import numpy as np
 from tests.factories.files import AXES, header_text
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.process import process_capture
+from unmix_plugin.captures.writing.view_files import ViewRecord
 
 HEIGHT, WIDTH, BANDS = 24, 32, 9
 WAVELENGTHS_NM = np.linspace(450.0, 850.0, BANDS)
@@ -95,3 +96,12 @@ def _reflectance(generator: np.random.Generator) -> np.ndarray:
     square = 0.3 + 0.4 * generator.random((HEIGHT // 2, WIDTH // 2, 1)) * np.linspace(0.5, 1.0, BANDS)
     values[HEIGHT // 4 : HEIGHT // 4 + len(square), WIDTH // 4 : WIDTH // 4 + square.shape[1]] = square
     return values
+
+
+def record_of(name: str, **facts: float) -> ViewRecord:
+    """A record of a view in which nothing is wrong, but for the facts."""
+    values = {
+        "num_pixels": 120 * 120, "saturated_pixels": 0, "clipped_values": 0, "negative_values": 0,
+        "missing_pixels": 0, "matter_share": 0.5, "specks": 0, "holes": 0, "brightness": 0.5, "detail": 1.0,
+    }  # fmt: skip
+    return ViewRecord(name=name, sensor="", paths={}, mean_spectrum=[], **{**values, **facts})  # type: ignore[arg-type]

@@ -16,8 +16,8 @@ Source: features as in Lowe 2004, Distinctive image features from scale-invarian
 from __future__ import annotations
 
 import warnings
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
 
@@ -26,7 +26,6 @@ from jaxtyping import Float64, Int
 
 from unmix_plugin.captures.poses.lens import Lens, Points
 from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera, angles_between_axes
-from unmix_plugin.captures.report import Code, Remark
 from unmix_plugin.engine.sampling import evenly_spaced
 
 _LONGEST_SIDE_PX = 320
@@ -61,9 +60,6 @@ _POSES_OFF_PX = 4.0
 """Distance left with any lens, from which poses are said to be wrong."""
 _FITS_PX, _MOST_FITTING = 1.5, 0.35
 """Distance at which a point fits, and their share with which poses can't be wrong, whatever the others do."""
-_TIMES_USUAL_MISS, _LEAST_TRACKS, _MOST_OTHER_POSES = 4.0, 10, 0.25
-"""Distance of a view's points over the usual one, points by which a view is judged, and share of views, with which some
-are said to have other poses."""
 
 
 MatchedView: TypeAlias = tuple[PosedCamera, Path]
@@ -84,36 +80,6 @@ class _Star:
     positions: Float64[np.ndarray, "V 3"]
     focal_px: float
     """Pixels of the picture in which features are found."""
-    views: tuple[int, ...] = ()
-    """Indices of the views, the one in the middle first."""
-
-    def without(self, views: Collection[int]) -> _Star:
-        """The points that enough of the other views show."""
-        kept = [index not in views for index in self.views]
-        ideal = self.ideal[:, kept]
-        shown = np.isfinite(ideal[..., 0])
-        ideal = ideal[shown[:, 0] & (shown.sum(axis=1) >= _LEAST_VIEWS)]
-        kept_views = tuple(index for index in self.views if index not in views)
-        return replace(
-            self,
-            ideal=ideal,
-            rotations=self.rotations[kept],
-            positions=self.positions[kept],
-            views=kept_views,
-        )
-
-    def centre_miss_px(self) -> float:
-        """From where the view in the middle shows points to where the others place them, median; NaN with few."""
-        if len(self.ideal) < _LEAST_TRACKS:
-            return float("nan")
-        away = self.ideal[:, 0]
-        around = self.ideal.copy()
-        around[:, 0] = np.nan
-        others = replace(self, ideal=around)
-        places = others.places(around)
-        before = (places - self.positions[0]) @ self.rotations[0]
-        found = before[:, :2] / np.maximum(before[:, 2:], 1e-6)
-        return self.focal_px * float(np.median(np.linalg.norm(np.clip(found - away, -1.0, 1.0), axis=1)))
 
     def places(self, ideal: Float64[np.ndarray, "T V 2"]) -> Float64[np.ndarray, "T 3"]:
         """Where the rays of points meet."""
@@ -137,16 +103,12 @@ class _Star:
 class MatchedScene:
     """Points that views share, found once."""
 
-    names: tuple[str, ...]
     stars: tuple[_Star, ...]
     lens: Lens | None
     """Of the first view."""
-    cameras: tuple[PosedCamera, ...] = ()
-    features: Mapping[int, _Features | None] = field(default_factory=dict, repr=False)
-    """Of the views that are compared."""
 
     @staticmethod
-    def of(names: Sequence[str], views: Sequence[MatchedView]) -> MatchedScene:
+    def of(views: Sequence[MatchedView]) -> MatchedScene:
         """Match the features of near views of one sensor."""
         cameras = [camera for camera, _ in views]
         angles_deg = np.degrees(angles_between_axes(cameras))
@@ -164,82 +126,7 @@ class MatchedScene:
         pairs: _Pairs = {}
         found = [_find_star(star, cameras, features, pairs) for star in chosen]
         stars = tuple(star for star in found if star is not None)
-        return MatchedScene(tuple(names), stars, cameras[0].lens, tuple(cameras), features)
-
-    def without(self, views: Collection[str]) -> MatchedScene:
-        """The points that the other views share."""
-        excluded = [index for index, name in enumerate(self.names) if name in views]
-        kept = [star.without(excluded) for star in self.stars if star.views[0] not in excluded]
-        features = {index: found for index, found in self.features.items() if index not in excluded}
-        return replace(self, stars=tuple(star for star in kept if len(star.ideal)), features=features)
-
-
-def views_of_other_poses(scene: MatchedScene) -> dict[str, Remark]:
-    """Views whose pictures do not fit their poses, while those of the others do: that show points elsewhere than where
-    the others place them, the worst first, or share nothing with those around them."""
-    found: dict[str, Remark] = {}
-    shrunk, rest = _shrunk(scene.lens), scene
-    most = int(_MOST_OTHER_POSES * len(scene.names))
-    while True:
-        rest = rest.without(found)
-        misses = {star.views[0]: star.centre_miss_px() for star in rest.stars}
-        misses = {view: miss for view, miss in misses.items() if np.isfinite(miss)}
-        if len(misses) < _LEAST_VIEWS + 1:
-            break
-        worst, usual = max(misses, key=lambda view: misses[view]), float(np.median([*misses.values()]))
-        if misses[worst] < max(_POSES_OFF_PX, _TIMES_USUAL_MISS * usual):
-            break
-        pixels = {"miss_px": misses[worst] / shrunk, "usual_px": usual / shrunk}
-        name = scene.names[worst]
-        found[name] = Remark.of(Code.VIEW_OF_OTHER_POSE, [name], **pixels)
-        if len(found) > most:
-            found = {}
-            break
-    found |= _among_strangers(scene.without(found))
-    return found if len(found) <= _MOST_OTHER_POSES * len(scene.names) else {}
-
-
-def _among_strangers(scene: MatchedScene) -> dict[str, Remark]:
-    """Views that share nothing with those around them, by their poses, but with others, which the poses do not fit."""
-    tracks = {star.views[0]: len(star.ideal) for star in scene.stars}
-    if len(tracks) < _LEAST_VIEWS or np.median([*tracks.values()]) < _LEAST_TRACKS:
-        return {}
-    known = {view for view, count in tracks.items() if count >= _LEAST_TRACKS}
-    usual = float(np.nanmedian([star.centre_miss_px() for star in scene.stars]))
-    found: dict[str, Remark] = {}
-    for view in sorted(scene.features.keys() - known):
-        ours = scene.features[view]
-        if ours is None:
-            continue
-        misses = []
-        for other in sorted(known):
-            theirs = scene.features[other]
-            assert theirs is not None
-            pairs = _matches(ours, theirs, _shrunk(scene.lens))
-            if len(pairs[0]) > 2 * _LEAST_MATCHES:
-                seen = (ours[0][pairs[0]], theirs[0][pairs[1]])
-                misses.append(_off_epipolar_lines_px(seen, scene.cameras[view], scene.cameras[other]))
-        if len(misses) >= _LEAST_VIEWS - 1 and min(misses) > _POSES_OFF_PX:
-            shrunk = _shrunk(scene.lens)
-            pixels = {"miss_px": float(np.median(misses)) / shrunk, "usual_px": usual / shrunk}
-            found[scene.names[view]] = Remark.of(Code.VIEW_OF_OTHER_POSE, [scene.names[view]], **pixels)
-    return found
-
-
-def _off_epipolar_lines_px(seen: tuple[Points, Points], one: PosedCamera, other: PosedCamera) -> float:
-    """Median distance of points of one view from the epipolar lines of the other, by the poses, in pixels of the
-    picture in which features are found."""
-    assert one.lens is not None
-    assert other.lens is not None
-    ideal = [lens.ideal_of(pixels) for lens, pixels in zip((one.lens, other.lens), seen, strict=True)]
-    if ideal[0] is None or ideal[1] is None:
-        return float("nan")
-    first, second = (np.column_stack([points, np.ones(len(points))]) for points in (ideal[0], ideal[1]))
-    turns = [camera.camera_to_world[:, :3] @ FLIP for camera in (one, other)]
-    moved = turns[0].T @ (other.camera_to_world[:, 3] - one.camera_to_world[:, 3])
-    lines = np.cross(moved, second @ (turns[0].T @ turns[1]).T)
-    away = np.abs((lines * first).sum(axis=1)) / np.maximum(np.linalg.norm(lines[:, :2], axis=1), 1e-12)
-    return float(np.median(away)) * _shrunk(one.lens) * float(np.mean(one.lens.focal_px))
+        return MatchedScene(stars, cameras[0].lens)
 
 
 def check_matches(scene: MatchedScene, findings: list[str]) -> str:
@@ -361,7 +248,7 @@ def _find_star(
         return None
     poses = np.stack([camera.camera_to_world for camera in cameras])
     focal_px = _shrunk(lenses[0]) * float(np.mean(lenses[0].focal_px))
-    return _Star(ideal, poses[:, :, :3] @ FLIP, poses[:, :, 3], focal_px, tuple(views))
+    return _Star(ideal, poses[:, :, :3] @ FLIP, poses[:, :, 3], focal_px)
 
 
 def _matches(

@@ -13,7 +13,6 @@ from unmix_plugin.captures.calibration.references import GivenReferences, requir
 from unmix_plugin.captures.cube import Capture, CaptureView, Cube, ReadOptions
 from unmix_plugin.captures.finding_poses import marked_poses, poses_of_written_views
 from unmix_plugin.captures.layouts.masks import with_mask_files
-from unmix_plugin.captures.match_checks import views_of_other_poses
 from unmix_plugin.captures.options import (
     ESTIMATE,
     FROM_PICTURES,
@@ -26,6 +25,7 @@ from unmix_plugin.captures.options import (
     parse_mosaic,
 )
 from unmix_plugin.captures.plan import Plan, decisions_of, make_plan
+from unmix_plugin.captures.pose_agreement import views_of_other_poses
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.posing import PosedViews, asked_distance, given_poses, pose_views
 from unmix_plugin.captures.readers.opening import open_spectral_file
@@ -33,7 +33,7 @@ from unmix_plugin.captures.report import Code, Kind, Remark, sentences
 from unmix_plugin.captures.spoilt import UnreadableViews, judge_sharpness
 from unmix_plugin.captures.wavelengths import parse_wavelengths
 from unmix_plugin.captures.writing.resampling import Resampling
-from unmix_plugin.captures.writing.scene_files import match_views, seen_views, write_scene_files
+from unmix_plugin.captures.writing.scene_files import seen_views, write_scene_files
 from unmix_plugin.captures.writing.view_files import ViewRecord, write_view
 from unmix_plugin.captures.writing.work_folder import (
     WorkFolder,
@@ -129,12 +129,12 @@ def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list
     for note in sentences(posed.remarks, Kind.DONE):
         say(f"poses: {note}")
     posed = replace(posed, views=tuple(_without(posed.views, left_out)))
-    matched = match_views(seen_views(folder.path, plan, posed, records))
     if options.poses not in (ESTIMATE, TURNTABLE):  # which the pictures themselves decide
-        others = views_of_other_poses(matched)
-        left_out |= {name: remark for name, remark in others.items() if name not in options.keep_view}
+        seen = [view for view in seen_views(folder.path, plan, posed, records) if view.camera.lines is None]
+        for sensor in plan.sensors:
+            others = views_of_other_poses([view for view in seen if view.record.sensor == sensor])
+            left_out |= {name: remark for name, remark in others.items() if name not in options.keep_view}
         posed = replace(posed, views=tuple(_without(posed.views, left_out)))
-        matched = matched.without(left_out)
     reasons = [*left_out.values()]
     decided = decisions_of(plan, posed, reasons, options)
     for line in decision_table(decided):
@@ -145,7 +145,6 @@ def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list
         posed,
         records,
         options=options,
-        matched=matched,
         left_out=reasons,
         decided=decided,
     )

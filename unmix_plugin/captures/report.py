@@ -192,8 +192,8 @@ class Code(Enum):
         "{where} takes it back"
     )
     VIEW_OF_OTHER_POSE = _wrong(
-        "{where} is left out: its picture does not fit its pose ({miss_px:.0f} px off, {usual_px:.1f} px are usual): "
-        "is it that of another view? --keep-view {where} takes it back"
+        "{where} is left out: with its pose it differs from the views around it {off} as much as with the pose of any "
+        "other view, where {usual} are usual: does the pose belong to another view? --keep-view {where} takes it back"
     )
     VIEW_UNREADABLE = _wrong("{where} is left out, as its file can't be read: {why}")
     VIEW_NOT_WANTED = _done("{where} is left out, as --leave-out says")

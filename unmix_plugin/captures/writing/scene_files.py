@@ -72,20 +72,19 @@ def seen_views(
     return seen
 
 
-def match_views(seen: Sequence[SeenView]) -> MatchedScene:
-    """What the views share of the sensor that took the most; nothing is matched between pictures of line cameras, which
-    no fundamental matrix explains."""
-    if any(view.camera.lines is not None for view in seen):
-        return MatchedScene(tuple(view.name for view in seen), (), None)
-    greatest = _greatest_sensor(seen)
-    same = [view for view in seen if view.record.sensor == greatest]
-    return MatchedScene.of([view.name for view in same], [(view.camera, view.picture) for view in same])
-
-
 def _greatest_sensor(seen: Sequence[SeenView]) -> str:
     """The sensor that took the most views."""
     ((greatest, _),) = Counter(view.record.sensor for view in seen).most_common(1)
     return greatest
+
+
+def _matched(seen: Sequence[SeenView]) -> MatchedScene:
+    """What the views share of the sensor that took the most; nothing is matched between pictures of line cameras, which
+    no fundamental matrix explains."""
+    if any(view.camera.lines is not None for view in seen):
+        return MatchedScene((), None)
+    greatest = _greatest_sensor(seen)
+    return MatchedScene.of([(view.camera, view.picture) for view in seen if view.record.sensor == greatest])
 
 
 def write_scene_files(
@@ -95,7 +94,6 @@ def write_scene_files(
     records: dict[str, ViewRecord],
     *,
     options: ProcessOptions,
-    matched: MatchedScene,
     left_out: Sequence[Remark] = (),
     decided: Sequence[Decision] = (),
 ) -> list[str]:
@@ -103,7 +101,6 @@ def write_scene_files(
 
     Args:
         records: Of the views that are written, with some that are left out.
-        matched: What the views share that are not left out, of the sensor that took the most.
         left_out: Why views are left out, one each.
         decided: For the report.
     Returns:
@@ -139,7 +136,7 @@ def write_scene_files(
         samples = [ViewSample.of(view.record, folder) for view in same]
         checked += check_values(samples, angles_between(same), sensor.centers_nm)
     findings += sentences(checked, Kind.WRONG)
-    measured = [*sentences(checked, Kind.MEASURED), check_matches(matched, findings)]
+    measured = [*sentences(checked, Kind.MEASURED), check_matches(_matched(seen), findings)]
 
     sizes = []
     for name, sensor in plan.sensors.items():
