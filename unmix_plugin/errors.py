@@ -7,9 +7,7 @@ traceback and exit with status 2; anything else that escapes is an internal erro
 import difflib
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from importlib import metadata
-from typing import Any
 
 
 class UnmixError(Exception):
@@ -84,34 +82,3 @@ def name_some(names: Sequence[str], most: int = 3) -> str:
     'a, b and 1 more'
     """
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
-
-
-@dataclass(frozen=True)
-class Check:
-    """One rule that settings must keep."""
-
-    fields: str | tuple[str, ...]
-    """The field that it bounds; or all that it is about, whose values a message tells."""
-    rule: str
-    """What follows the field's name, such as "of at least 1"; of several fields the whole rule, named as flags are."""
-    holds: bool
-
-    def broken(self, settings: Any) -> str:
-        """The rule in words, and what was found."""
-        names = (self.fields,) if isinstance(self.fields, str) else self.fields
-        rule = f"{_flag(names[0])} {self.rule}" if isinstance(self.fields, str) else self.rule
-        values = [(_flag(name), getattr(settings, name)) for name in names]
-        named = [(name, "none" if value is None else value) for name, value in values]
-        shown = [str(value) if len(named) == 1 else f"{name} {value}" for name, value in named]
-        return f"{rule} (got {', '.join(shown)})" if shown else rule
-
-
-def _flag(name: str) -> str:
-    return name.replace("_", "-")
-
-
-def require(what: str, settings: Any, checks: Iterable[Check]) -> None:
-    """Refuse settings, called `what` in the message, that don't keep all rules. Raises ConfigError: with all rules that
-    are broken, and what was found."""
-    if broken := [check.broken(settings) for check in checks if not check.holds]:
-        raise ConfigError(f"{what} needs {' and '.join(broken)}")

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from unmix_plugin.engine.configs import (
     AtStartOnly,
+    Check,
     CommonFlag,
     DataManagerConfig,
     ModelConfig,
@@ -23,7 +24,7 @@ from unmix_plugin.engine.configs import (
     Within,
     short_flag,
 )
-from unmix_plugin.errors import Check, ConfigError
+from unmix_plugin.errors import ConfigError
 from unmix_plugin.presets import Auto, fill_auto, preset_for
 
 if TYPE_CHECKING:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from unmix_plugin.engine.configs import AtStartOnly as AtStartOnly
+    from unmix_plugin.engine.configs import Check as Check
     from unmix_plugin.engine.configs import CommonFlag as CommonFlag
     from unmix_plugin.engine.configs import DataManagerConfig as DataManagerConfig
     from unmix_plugin.engine.configs import InstantiateConfig as InstantiateConfig
@@ -51,6 +52,7 @@ if TYPE_CHECKING:
 _MODULES = {
     "configs": (
         "AtStartOnly",
+        "Check",
         "CommonFlag",
         "DataManagerConfig",
         "InstantiateConfig",

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, get_args, g
 
 import tyro
 
-from unmix_plugin.errors import Check, ConfigError, require
+from unmix_plugin.errors import ConfigError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -42,6 +42,27 @@ AtStartOnly = "at start"
 def short_flag(name: str) -> Any:
     """Annotation that gives a setting the flag `--name` beside its long one."""
     return tyro.conf.arg(aliases=(f"--{name}",))
+
+
+@dataclass(frozen=True)
+class Check:
+    """One rule that settings must keep."""
+
+    fields: str | tuple[str, ...]
+    """The field that it bounds; or all that it is about, whose values a message tells."""
+    rule: str
+    """What follows the field's name, such as "of at least 1"; of several fields the whole rule, named as flags are."""
+    holds: bool
+
+    def broken(self, settings: Any) -> str:
+        """The rule in words, and what was found."""
+        names = (self.fields,) if isinstance(self.fields, str) else self.fields
+        values = {name.replace("_", "-"): getattr(settings, name) for name in names}
+        shown = [f"{name} {'none' if value is None else value}" for name, value in values.items()]
+        if len(shown) == 1:
+            shown = [text.partition(" ")[2] for text in shown]
+        rule = f"{next(iter(values))} {self.rule}" if isinstance(self.fields, str) else self.rule
+        return f"{rule} (got {', '.join(shown)})" if shown else rule
 
 
 @dataclass(frozen=True)
@@ -99,11 +120,12 @@ class Settings:
 
     def __post_init__(self) -> None:
         """Refuse numbers that are not `Within` their intervals, and broken `rules`, all by one `ConfigError`."""
-        intervals = [
+        checks = [
             Check(name, rule, interval.holds(getattr(self, name)))
             for name, (interval, rule) in _intervals(type(self)).items()
         ]
-        require(self._called, self, [*intervals, *self.rules()])
+        if broken := [check.broken(self) for check in (*checks, *self.rules()) if not check.holds]:
+            raise ConfigError(f"{self._called} needs {' and '.join(broken)}")
 
     def rules(self) -> Sequence[Check]:
         """What else must hold; a subclass adds to those of its base."""

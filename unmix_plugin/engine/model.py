@@ -158,6 +158,15 @@ class Model(nn.Module, ABC):
         """Where the parameters are."""
         return next(self.parameters()).device
 
+    def frozen_parameters(self, averages: Mapping[str, Tensor] | None) -> dict[int, nn.Parameter]:
+        """Copies of the parameters without gradients, by the parameters' ids, as `copy.deepcopy` takes them; of
+        `averages`, by the parameters' names, where there are any."""
+        values = dict(averages or {})
+        return {
+            id(param): nn.Parameter(values.get(name, param).detach().clone(), requires_grad=False)
+            for name, param in self.named_parameters()
+        }
+
     @property
     def rays_per_chunk(self) -> int:
         """Rays of a whole image under way at once."""

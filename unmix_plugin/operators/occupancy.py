@@ -163,12 +163,12 @@ class OccupancyGrid(nn.Module):
         self.register_buffer("occupied", reachable.to(torch.uint8))
         opaque = torch.zeros(reachable.shape, dtype=torch.uint8) if casts_shadows else None
         self.register_buffer("opaque", opaque)
-        self.register_buffer("opaque_skips", _skips(opaque), persistent=False)
         self.register_buffer(
             "observed", torch.full(reachable.shape, _NOT_OBSERVED) if records_observed else None
         )
-        self.register_buffer("skips", skip_distances(reachable), persistent=False)
-        self.register_buffer("reachable_cells", _flat_indices(reachable), persistent=False)
+        for name in ("reachable_cells", "skips", "opaque_skips"):
+            self.register_buffer(name, None, persistent=False)
+        self._follow()
         self.register_load_state_dict_post_hook(lambda grid, _: grid._follow())
 
     @torch.no_grad()
@@ -259,11 +259,11 @@ class OccupancyGrid(nn.Module):
         return torch.cat(chosen).unique()
 
     def _follow(self) -> None:
-        """Find what follows from cells that were loaded or emptied: searching the whole grid takes longer than an
+        """Find what follows from cells that are new, loaded or emptied: searching the whole grid takes longer than an
         update."""
-        self.reachable_cells = _flat_indices(self.reachable)
+        self.reachable_cells = self.reachable.view(-1).nonzero()[:, 0]
         self.skips = skip_distances(self.occupied != 0)
-        self.opaque_skips = _skips(self.opaque)
+        self.opaque_skips = None if self.opaque is None else skip_distances(self.opaque != 0)
 
 
 def _block_maxima(values: Float[Tensor, "X Y Z"], block: int) -> Float[Tensor, "X Y Z"]:
@@ -272,11 +272,3 @@ def _block_maxima(values: Float[Tensor, "X Y Z"], block: int) -> Float[Tensor, "
     for axis, side in enumerate(values.shape):
         found = found.repeat_interleave(block, dim=axis).narrow(axis, 0, side)
     return found
-
-
-def _flat_indices(reachable: Bool[Tensor, "X Y Z"]) -> Int[Tensor, "N"]:
-    return reachable.view(-1).nonzero()[:, 0]
-
-
-def _skips(cells: UInt8[Tensor, "X Y Z"] | None) -> UInt8[Tensor, "X Y Z"] | None:
-    return None if cells is None else skip_distances(cells != 0)

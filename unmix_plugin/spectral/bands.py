@@ -51,7 +51,15 @@ class Bands:
     def __post_init__(self) -> None:
         centers = np.array(self.centers_nm, dtype=np.float64)
         _require_one_axis(centers)
-        _require_increasing(centers)
+        for rule, holds in (("be finite", np.isfinite(centers)), ("be positive", centers > 0)):
+            if not holds.all():
+                i = int(np.argmin(holds))
+                raise SpectrumError(f"wavelengths must {rule}; found {centers[i]:g} nm at index {i}")
+        for i in np.flatnonzero(np.diff(centers) <= 0).tolist():
+            raise SpectrumError(
+                f"wavelengths must strictly increase; found {centers[i]:g} nm at index {i} "
+                f"then {centers[i + 1]:g} nm at index {i + 1}; sort the bands and drop repeated ones"
+            )
         centers.setflags(write=False)
         object.__setattr__(self, "centers_nm", centers)
 
@@ -207,18 +215,6 @@ def _require_one_axis(centers: np.ndarray) -> None:
     if centers.ndim != 1 or centers.size == 0:
         raise SpectrumError(
             f"wavelengths must be a list of at least one number in nm; found an array of shape {centers.shape}"
-        )
-
-
-def _require_increasing(centers: np.ndarray) -> None:
-    for rule, holds in (("be finite", np.isfinite(centers)), ("be positive", centers > 0)):
-        if not holds.all():
-            i = int(np.argmin(holds))
-            raise SpectrumError(f"wavelengths must {rule}; found {centers[i]:g} nm at index {i}")
-    for i in np.flatnonzero(np.diff(centers) <= 0).tolist():
-        raise SpectrumError(
-            f"wavelengths must strictly increase; found {centers[i]:g} nm at index {i} "
-            f"then {centers[i + 1]:g} nm at index {i + 1}; sort the bands and drop repeated ones"
         )
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Literal, Protocol, runtime_checkable
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import SceneBox
@@ -131,20 +131,10 @@ def model_scene(
             f"{type(model).__name__} names no outputs that could be shown: give its class `outputs`, a tuple of "
             "unmix_plugin.engine.Output (docs/guides/plugins.md, What other methods get)"
         )
-    still = copy.deepcopy(model, frozen_parameters(model, averages)).eval()  # type: ignore[arg-type]
+    still = copy.deepcopy(model, model.frozen_parameters(averages)).eval()  # type: ignore[arg-type]
     nm = model.metadata.get("wavelengths_nm")
     bands = None if nm is None else Bands.of(nm)
     return ModelScene(still, world_frame(record), recorded_views(record), still.outputs, bands=bands)
-
-
-def frozen_parameters(model: Model, averages: Mapping[str, Tensor] | None) -> dict[int, nn.Parameter]:
-    """Copies of a model's parameters without gradients, by the parameters' ids, as `copy.deepcopy` takes them; of
-    `averages`, by the parameters' names, where there are any."""
-    values = dict(averages or {})
-    return {
-        id(param): nn.Parameter(values.get(name, param).detach().clone(), requires_grad=False)
-        for name, param in model.named_parameters()
-    }
 
 
 @dataclass(frozen=True)

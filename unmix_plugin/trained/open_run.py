@@ -26,7 +26,7 @@ from unmix_plugin.scenes.scene import Scene, scene_identity
 from unmix_plugin.settings import SceneOptions
 from unmix_plugin.trained.measured_errors import read_errors
 from unmix_plugin.trained.measures import Measures, Scale, read_measures, recorded_scale
-from unmix_plugin.trained.model_scene import frozen_parameters, model_scene
+from unmix_plugin.trained.model_scene import model_scene
 from unmix_plugin.trained.places import MeasuredScene
 from unmix_plugin.trained.protocol import RenderableScene
 from unmix_plugin.trained.run_views import recorded_views, world_frame
@@ -42,7 +42,7 @@ def unmix_scene(
     Cameras of the record are shown as they were corrected, those of evaluation views with the corrected lens. Errors
     are those of `world_frame` and `recorded_scale`.
     """
-    frozen = frozen_parameters(model, averages)
+    frozen = model.frozen_parameters(averages)
     materials = model.materials
     specular = frozen.get(id(materials.specular_spectra), materials.specular_spectra)
     if model.poses is not None:

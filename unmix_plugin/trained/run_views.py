@@ -33,12 +33,18 @@ class RunView:
 
 
 def recorded_views(record: SceneRecord) -> tuple[RunView, ...]:
-    """Training views, then evaluation views, named as the scene's frames are."""
-    train, evaluation = record.train_cameras, record.eval_cameras
-    return (
-        *(RunView(name, train[i], "train") for i, name in enumerate(_names(record, "train", len(train)))),
-        *(RunView(name, evaluation[i]) for i, name in enumerate(_names(record, "eval", len(evaluation)))),
-    )
+    """Training views, then evaluation views, named as the scene's frames are; `eval_000` where the data manager has
+    noted no names."""
+    views = []
+    splits: tuple[tuple[Literal["train", "eval"], Cameras], ...]
+    splits = ("train", record.train_cameras), ("eval", record.eval_cameras)
+    for split, cameras in splits:
+        names = [f"{split}_{number:03d}" for number in range(len(cameras))]
+        frames, indices = record.summary.get("frames"), record.summary.get(f"{split}_indices")
+        if isinstance(frames, list) and isinstance(indices, list) and len(indices) == len(cameras):
+            names = [str(frames[index]) for index in indices]
+        views += [RunView(name, cameras[number], split) for number, name in enumerate(names)]
+    return tuple(views)
 
 
 def find_view(numbered: Sequence[RunView], wanted: str, others: Sequence[RunView] = ()) -> RunView:
@@ -115,14 +121,6 @@ def world_up(views: Sequence[RunView], frame: Normalisation) -> Float64[np.ndarr
     """What is up in the world of the scene, a unit vector, from its training views."""
     up = np.asarray(up_direction(cameras_of(views, "train")), dtype=np.float64)
     return directions_to_world(frame, up)
-
-
-def _names(record: SceneRecord, split: str, count: int) -> list[str]:
-    """Frame names, or `eval_000` where the data manager has noted none."""
-    frames, indices = record.summary.get("frames"), record.summary.get(f"{split}_indices")
-    if isinstance(frames, list) and isinstance(indices, list) and len(indices) == count:
-        return [str(frames[index]) for index in indices]
-    return [f"{split}_{index:03d}" for index in range(count)]
 
 
 _PRECISION = 1e-6

@@ -55,7 +55,7 @@ class RayBundle:
         """The rays of several bundles that know the same of their rays, one after the other."""
         if len(bundles) == 1:
             return bundles[0]
-        columns = zip(*(bundle._columns() for bundle in bundles), strict=True)
+        columns: Any = [[getattr(bundle, field.name) for bundle in bundles] for field in fields(RayBundle)]
         joined: list[Any] = [None if column[0] is None else torch.cat(column) for column in columns]
         return RayBundle(*joined)
 
@@ -64,11 +64,9 @@ class RayBundle:
         return self._map(lambda column: column.to(device))
 
     def _map(self, change: Callable[[Tensor], Tensor]) -> RayBundle:
-        columns: list[Any] = [None if column is None else change(column) for column in self._columns()]
-        return RayBundle(*columns)
-
-    def _columns(self) -> list[Any]:
-        return [getattr(self, field.name) for field in fields(self)]
+        columns = (getattr(self, field.name) for field in fields(self))
+        changed: list[Any] = [None if column is None else change(column) for column in columns]
+        return RayBundle(*changed)
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ import tyro
 
 from unmix_plugin.engine import (
     AtStartOnly,
+    Check,
     CommonFlag,
     ModelConfig,
     Target,
@@ -20,7 +21,6 @@ from unmix_plugin.engine import (
     config_from_json,
     short_flag,
 )
-from unmix_plugin.errors import Check
 from unmix_plugin.neumatex.fit.tone import LightCurve, ToneMapping
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.unmixing.endmembers import EndmemberMethod

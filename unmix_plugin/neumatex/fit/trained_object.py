@@ -33,7 +33,7 @@ from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.spectral.segmentation import material_ids
-from unmix_plugin.trained.model_scene import LightChoice, ModelView, frozen_parameters
+from unmix_plugin.trained.model_scene import LightChoice, ModelView
 from unmix_plugin.trained.protocol import Probe
 from unmix_plugin.trained.run_views import RunView, recorded_views, world_frame
 from unmix_plugin.trained.trained_scene import one_pixel
@@ -342,10 +342,10 @@ def trained_object(
     """The object of a model as it is now, trained or in training; training that goes on does not change it.
 
     Args:
-        model, averages: As `frozen_parameters` takes them.
+        model, averages: As `Model.frozen_parameters` takes them.
         record: Cameras and frame of its run.
     """
-    frozen = frozen_parameters(model, averages)
+    frozen = model.frozen_parameters(averages)
     triplane = copy.deepcopy(model.triplane, dict(frozen))  # type: ignore[arg-type]
     curve = copy.deepcopy(model.curve, dict(frozen))  # type: ignore[arg-type]
     family = copy.deepcopy(model.family, dict(frozen))  # type: ignore[arg-type]
