@@ -313,12 +313,12 @@ def test_a_backdrop_is_found_beside_pixels_that_dont_count_and_they_are_not_look
 
 
 def test_light_without_alpha_is_judged_by_the_pixels_that_masks_leave(tmp_path, monkeypatch):
-    folder = make_scene(tmp_path / "scene")
+    folder = make_scene(tmp_path / "scene", alpha=False)
     manager = make(folder.root)
     height, width = manager.scene.valid_mask(1).shape
     Image.fromarray(np.tri(height, width) > 0).save(folder.root / "mask.png")
     folder.edit(lambda content: [frame.update(mask_path="mask.png") for frame in content["frames"]])
     asked = []
     monkeypatch.setattr(datamanager, "find_matched_points", lambda views: asked.append(views.valid(0)))
-    assert make(folder.root)._judge_matched() == "fixed"
+    assert make(folder.root).initial_data()["light"] == "fixed"
     assert np.array_equal(asked[0], np.tri(height, width) > 0)

@@ -19,7 +19,7 @@ from unmix_plugin.commands.train import parse, train
 from unmix_plugin.commands.training import remark_on_passes, remarks_on_course
 from unmix_plugin.engine import registry
 from unmix_plugin.engine.runs.load_run import load_config, load_model
-from unmix_plugin.engine.training.trainer import Trainer
+from unmix_plugin.engine.training.steps import TrainingSteps
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.spectral.library.spectra_csv import read_spectra
 
@@ -134,14 +134,14 @@ def test_a_broken_plugin_is_a_warning_and_the_others_go_on(monkeypatch):
 
 
 def test_ctrl_c_saves_exits_130_and_says_how_to_go_on_which_then_works(trained, tmp_path, monkeypatch):
-    step = Trainer._train_step
+    take = TrainingSteps.take
 
-    def interrupted_at_3(self):
-        if self.step == 3:
+    def interrupted_at_3(self, step, progress):
+        if step == 3:
             signal.raise_signal(signal.SIGINT)
-        return step(self)
+        return take(self, step, progress)
 
-    monkeypatch.setattr(Trainer, "_train_step", interrupted_at_3)
+    monkeypatch.setattr(TrainingSteps, "take", interrupted_at_3)
     ended = run(train, *small_training(trained, tmp_path / "out", "--max-seconds", 1000))
     monkeypatch.undo()
     assert ended.status == 130
@@ -227,12 +227,12 @@ def test_a_run_of_another_method_is_not_gone_on_with(run_copy):
 
 
 def test_a_full_disk_while_saving_exits_2_and_says_so(trained, tmp_path, monkeypatch):
-    def full_from_the_first_step(self):
+    def full_from_the_first_step(*args):
         full_disk(monkeypatch, after=0)
-        return step(self)
+        return take(*args)
 
-    step = Trainer._train_step
-    monkeypatch.setattr(Trainer, "_train_step", full_from_the_first_step)
+    take = TrainingSteps.take
+    monkeypatch.setattr(TrainingSteps, "take", full_from_the_first_step)
     words = small_training(trained, tmp_path / "out", "--max-num-iterations", 2)
     assert "No space left on device" in refused(train, *words)
     assert not list(tmp_path.rglob("*.tmp"))

@@ -49,13 +49,13 @@ def test_without_keep_open_the_process_ends_with_the_training(trained, tmp_path)
 
 def test_the_viewer_stays_while_a_page_is_open_and_the_run_is_printed_last(trained, tmp_path, monkeypatch):
     monkeypatch.setattr(server, "_UNWATCHED_S", 1)
-    loop, is_page_open = Trainer._loop, threading.Event()
+    train_, is_page_open = Trainer.train, threading.Event()
 
-    def loop_once_a_page_is_open(self, *args):  # not in a step: pages wait for the model while one is taken
+    def train_once_a_page_is_open(self):  # not in a step: pages wait for the model while one is taken
         assert is_page_open.wait(START_S)
-        loop(self, *args)
+        return train_(self)
 
-    monkeypatch.setattr(Trainer, "_loop", loop_once_a_page_is_open)
+    monkeypatch.setattr(Trainer, "train", train_once_a_page_is_open)
 
     def visit(printed):
         with Page(address(printed)) as page:

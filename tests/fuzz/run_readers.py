@@ -27,7 +27,7 @@ from unmix_plugin.engine.runs.load_run import load_config
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.engine.runs.run_json import RUN_FORMAT
 from unmix_plugin.engine.runs.scene_record import read_scene_record
-from unmix_plugin.engine.training.progress import _keep_until
+from unmix_plugin.engine.training.progress import keep_lines_until
 from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.settings import SceneOptions
@@ -137,7 +137,9 @@ def metrics_reader() -> Reader:
 
 def _read_metrics(path: Path) -> None:
     before = path.read_bytes()
-    _keep_until(path, 2)  # the part of MetricsWriter that reads; TensorBoard's would start a thread a case
+    keep_lines_until(
+        path, 2
+    )  # the part of MetricsWriter that reads; TensorBoard's would start a thread a case
     for line in path.read_text(encoding="utf-8").splitlines():
         assert json.loads(line)["step"] <= 2
     if path.read_bytes() != before:

@@ -241,7 +241,7 @@ def test_levels_without_weight_change_nothing():
     points = torch.rand(20, 3, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
         whole = model.field.get_density(points)[1]
-        model._begin_step(1, 0.0)
+        model.get_training_callbacks()[0].func(1, 0.0)
         coarse = model.field.get_density(points)[1]
         field: Any = model.field
         field.table[int(field.layout.levels[1, 1]) :] += 1.0

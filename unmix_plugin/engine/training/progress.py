@@ -173,7 +173,7 @@ class MetricsWriter:
     def __init__(self, run: RunFolder, resumed_step: int = 0) -> None:
         """Go on after step `resumed_step`; what a stopped run wrote beyond it is cut off. Raises RunError."""
         self._path = run.metrics_path
-        _keep_until(self._path, resumed_step)
+        keep_lines_until(self._path, resumed_step)
         self._board = _tensorboard(run.path / "tensorboard", resumed_step)
 
     def write(
@@ -244,7 +244,7 @@ def _record(line: bytes) -> dict[str, Any] | None:
     return record if is_known else None
 
 
-def _keep_until(path: Path, step: int) -> None:
+def keep_lines_until(path: Path, step: int) -> None:
     """Rewrite a JSON-lines file without later steps' lines and without one cut off by a kill. One with lines that no
     run writes gets another name."""
     if not path.exists():
