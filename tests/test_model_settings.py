@@ -1,5 +1,7 @@
 """Settings of the model, what they find in the data, and the endmembers that it starts from."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -7,7 +9,7 @@ from torch.testing import assert_close
 
 from tests.factories.models import NUM_BANDS, WAVELENGTHS_NM, initial_data, make_model, make_rays
 from unmix_plugin.errors import ConfigError, SpectrumError
-from unmix_plugin.settings import LossConfig, UnmixModelConfig
+from unmix_plugin.settings import LossConfig, SceneOptions, UnmixModelConfig
 
 
 @pytest.mark.parametrize("trained", [True, False])
@@ -113,3 +115,18 @@ def test_light_exposure_and_relative_errors_follow_from_the_data_unless_they_are
     losses = LossConfig(exposure=1.0, band_weights=(), relative=0.0)
     config = UnmixModelConfig(num_endmembers=4, light="fixed", poses="fixed", losses=losses)
     assert config.resolve_auto(unread, torch.Generator()) == (config, "")
+
+
+@pytest.mark.parametrize(
+    ("option", "rule"),
+    [
+        *(
+            ({"value_scale": x}, "value-scale of 1e-30 to 1e30")
+            for x in (0.0, -1.0, 1e-320, math.nan, math.inf)
+        ),
+        *(({"eval_interval": x}, "eval-interval of at least 2") for x in (1, 0, -3)),
+    ],
+)
+def test_options_that_no_scene_can_be_read_with_are_refused(option, rule):
+    with pytest.raises(ConfigError, match=rule):
+        SceneOptions(**option)

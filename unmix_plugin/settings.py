@@ -67,10 +67,13 @@ _WHERE_LAMP = {
 
 
 @dataclass(frozen=True)
-class SceneOptions:
+class SceneOptions(Settings):
     """How to read a scene."""
 
-    value_scale: Annotated[float | None, CommonFlag, AtStartOnly, short_flag("value-scale")] = None
+    _called = "the scene"
+    value_scale: Annotated[
+        float | None, CommonFlag, AtStartOnly, short_flag("value-scale"), Within("[1e-30, 1e30]")
+    ] = None
     """Cubes are divided by this number (needed for integer cubes, such as 255 or 4095); None takes them as they are."""
     invalid_pixels: Annotated[Literal["refuse", "mask", "clip"], CommonFlag, short_flag("invalid-pixels")] = (
         "refuse"
@@ -82,7 +85,7 @@ class SceneOptions:
     eval_split: Annotated[Literal["auto", "lists", "filename", "interval"], short_flag("eval-split")] = "auto"
     """Evaluation frames by the lists of transforms.json, by folder or file name, or every n-th; auto takes the first
     of these that the scene supports."""
-    eval_interval: Annotated[int, short_flag("eval-interval")] = 8
+    eval_interval: Annotated[int, short_flag("eval-interval"), Within("[2, inf)")] = 8
     """With an interval split every n-th frame from the first on, or of a rig every n-th shot, is for evaluation."""
     world: Annotated[Literal["bounded", "unbounded", "auto"], CommonFlag, short_flag("world")] = "auto"
     """Whether all that pictures show lies in a box, or goes on behind it as far as the sky. Auto is bounded where

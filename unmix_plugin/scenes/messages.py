@@ -177,7 +177,6 @@ class Message(Enum):
         ),
         "with floats, 1 clips highlights instead",
     )
-    VALUE_SCALE = "--value-scale: is {scale:g}; expected a positive number, what stands for 1"
 
     # Pictures, masks and labels
     NO_PICTURE_FILE = "cannot be read as a picture: {formats} ({reason})"
@@ -225,7 +224,6 @@ class Message(Enum):
         "neither its folder nor its name starts with train, eval, val or test, which --eval-split filename "
         "needs"
     )
-    EVAL_INTERVAL = "is {interval}; expected 2 or more: frames are to be left to train on"
     NONE_TO_TRAIN = "no frame is left to train on ({how}); name some in 'train_filenames'"
     NONE_TO_EVALUATE = (
         "no frame is left to evaluate ({how}); name some in 'test_filenames' or use --eval-split interval"

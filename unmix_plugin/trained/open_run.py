@@ -16,7 +16,7 @@ from unmix_plugin.engine.configs import TrainerConfig
 from unmix_plugin.engine.model import Model
 from unmix_plugin.engine.registry import discover_methods, find_method
 from unmix_plugin.engine.runs.checkpoints import TrainingRecord
-from unmix_plugin.engine.runs.load_run import SceneRecord, load_config, load_model
+from unmix_plugin.engine.runs.load_run import SceneRecord, load_model, read_config
 from unmix_plugin.engine.runs.run_folder import RunFolder, open_run_folder
 from unmix_plugin.engine.runs.scene_record import differences, name_differences, read_scene_record
 from unmix_plugin.errors import ConfigError, RunError, SceneError
@@ -93,7 +93,7 @@ def find_scene(summary: Mapping[str, Any], run: Path, data: Path | None) -> Scen
         return None
     try:
         scene = load_scene(root, SceneOptions(**summary.get("options", {})))
-    except (SceneError, TypeError):
+    except (SceneError, ConfigError, TypeError):
         if data is None:
             return None
         raise
@@ -182,7 +182,7 @@ def open_measured(path: str | Path, data: str | Path | None = None) -> MeasuredS
         SceneError: the scene is missing, has changed, or is malformed.
     """
     run = open_run_folder(Path(path))
-    record = read_scene_record(run, load_config(run.path).pipeline.datamanager.target)
+    record = read_scene_record(run, read_config(run).pipeline.datamanager.target)
     scene = find_scene(record.summary, run.path, None if data is None else Path(data))
     if scene is None:
         place = record.summary.get("root")

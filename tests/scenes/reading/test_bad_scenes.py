@@ -81,10 +81,6 @@ def test_a_scale_that_clips_more_than_highlights_is_said_with_one_that_does_not(
         (lambda cube: cube * np.nan, {"invalid_pixels": "mask"}, "every pixel of the cube has a NaN"),
         (lambda cube: cube - 1, {"invalid_pixels": "clip"}, "values far below 0, which is not noise"),
         (lambda cube: np.uint16(0 * cube + 4000), {"value_scale": 255.0}, "division by --value-scale 255"),
-        *(
-            (lambda cube: cube, {"value_scale": scale}, "--value-scale: is")
-            for scale in (0.0, -1.0, 1e-320, float("nan"), float("inf"))
-        ),
     ],
 )
 def test_options_that_can_not_mend_the_cubes_are_refused(folder, change, options, message):

@@ -88,7 +88,7 @@ def _read_run(path: Path) -> tuple[RunFolder, TrainerConfig, SceneRecord, Checkp
     """All that the folder of a run holds for its model, with a warning where newer checkpoints are damaged; what a
     model would take too much memory for is refused before it is made. Raises RunError."""
     run = open_run_folder(path)
-    config = _read_config(run)
+    config = read_config(run)
     scene = read_scene_record(run, config.pipeline.datamanager.target)
     checkpoint = newest_complete_checkpoint(run.checkpoints)
     if checkpoint.damaged:
@@ -111,10 +111,11 @@ def load_config(path: Path) -> TrainerConfig:
         RunError: the run is missing, half-written or from another version, its settings lack some or do not fit the
             method, or the method is not installed.
     """
-    return _read_config(open_run_folder(path))
+    return read_config(open_run_folder(path))
 
 
-def _read_config(run: RunFolder) -> TrainerConfig:
+def read_config(run: RunFolder) -> TrainerConfig:
+    """The same of a run that is open."""
     stored = read_run_json(run.config_path).get("config")
     name = stored.get("method_name") if isinstance(stored, dict) else None
     try:

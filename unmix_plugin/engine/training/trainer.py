@@ -25,7 +25,7 @@ from unmix_plugin.engine.runs.checkpoints import (
     save_checkpoint,
 )
 from unmix_plugin.engine.runs.config_json import require_kept
-from unmix_plugin.engine.runs.load_run import load_config, require_data, write_config
+from unmix_plugin.engine.runs.load_run import read_config, require_data, write_config
 from unmix_plugin.engine.runs.replacing import remove
 from unmix_plugin.engine.runs.run_folder import (
     RunFolder,
@@ -83,7 +83,7 @@ class Trainer:
         with processes.together():
             resumed = None if config.load_run is None else open_run_folder(config.load_run)
             if resumed is not None:
-                refuse_changes_at_start(load_config(resumed.path), config)
+                refuse_changes_at_start(read_config(resumed), config)
             if config.data is not None and config.data.exists():  # found from any working directory then
                 config = replace(config, data=config.data.resolve())
             self.config, self.steps = prepare_steps(config, processes)

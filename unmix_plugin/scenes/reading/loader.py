@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from unmix_plugin.engine.runs.atomic_files import NOT_PORTABLE, safe_name
-from unmix_plugin.errors import SceneError, SpectrumError
+from unmix_plugin.errors import SpectrumError
 from unmix_plugin.scenes.folder import CUBE_KEY
 from unmix_plugin.scenes.messages import Message
 from unmix_plugin.scenes.reading.checks import CheckedFiles, check_frames
@@ -43,11 +43,8 @@ def load_scene(root: Path, options: SceneOptions | None = None) -> Scene:
         SceneError: the folder is not a sound scene; the message lists all that is wrong with it.
     """
     options, faults = options or SceneOptions(), Faults(root)
-    scale = options.value_scale
-    if scale is not None and not 1e-30 <= scale <= 1e30:  # float32 divides by these
-        raise SceneError(f"{root}: {Message.VALUE_SCALE.sentence(scale=scale)}")
     entry = read_entries(root, faults)
-    if scale is None:
+    if options.value_scale is None:
         options = replace(options, value_scale=entry.keys.value_scale)
     entry = locate_files(root, entry, options.allow_outside_paths, faults)
     truth = _read_truth(root, entry, options, faults)

@@ -57,7 +57,18 @@ def split_frames(
         validation = sorted(members.get("eval", []) + members.get("val", []))
         split = Split(tuple(members.get("train", [])), tuple(members.get("test") or validation))
     else:
-        split = _by_interval(entry, interval, faults)
+        # Every n-th shot evaluates; the frames that a rig took together stay together, they show the same.
+        numbers: dict[str | int, int] = {}
+        shots = [
+            numbers.setdefault(index if frame.shot is None else frame.shot, len(numbers))
+            for index, frame in enumerate(entry.frames)
+        ]
+        is_evaluated = [shot % interval == 0 for shot in shots]
+        train, evaluation = (
+            tuple(index for index, one in enumerate(is_evaluated) if one == chosen)
+            for chosen in (False, True)
+        )
+        split = Split(train, evaluation)
     how = "split chosen by itself" if method == "auto" else f"split by {method}"
     if entry.frames and not split.train:
         faults.note(FILE_NAME, Message.NONE_TO_TRAIN, how=how)
@@ -105,20 +116,3 @@ def _name_split(paths: dict[str, str]) -> str | None:
             if match := _SPLIT_NAME.match(word):
                 return next(name for name in _SPLIT_NAMES if match.group(1).lower().startswith(name))
     return None
-
-
-def _by_interval(entry: SceneEntry, interval: int, faults: Faults) -> Split:
-    """Every n-th shot evaluates; the frames that a rig took together stay together, they show the same."""
-    if interval < 2:
-        faults.note("--eval-interval", Message.EVAL_INTERVAL, interval=interval)
-        return Split((), ())
-    numbers: dict[str | int, int] = {}
-    shots = [
-        numbers.setdefault(index if frame.shot is None else frame.shot, len(numbers))
-        for index, frame in enumerate(entry.frames)
-    ]
-    train, evaluation = (
-        tuple(index for index, shot in enumerate(shots) if (shot % interval == 0) == is_evaluation)
-        for is_evaluation in (False, True)
-    )
-    return Split(train, evaluation)
