@@ -101,6 +101,13 @@ def test_what_fewer_than_three_views_see_is_not_judged():
     assert find_unexplained(SCENE, []) is None
 
 
+def test_nothing_is_said_of_endmembers_that_had_too_few_rays_to_settle():
+    views = floor_views(odd_spectrum())
+    num_pixels = sum(view.counts.size for view in views)
+    assert find_unexplained(SCENE, views, 2 * num_pixels) is None
+    assert find_unexplained(SCENE, views, 4 * num_pixels) is not None
+
+
 def test_materials_that_explain_nothing_well_are_said_to_be_too_few(tmp_path):
     one = replace(
         SCENE, materials=replace(SCENE.materials, endmembers=SCENE.materials.endmembers[:1], names=("a",))

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from unmix_plugin.engine.processes import Processes
+    from unmix_plugin.engine.runs.checkpoints import TrainingRecord
     from unmix_plugin.engine.training.trainer import Trainer
     from unmix_plugin.scenes.scene import Scene
     from unmix_plugin.trained.protocol import RenderableScene
@@ -187,14 +188,14 @@ def finish(trainer: Trainer, console: Console) -> None:
     data = trainer.pipeline.datamanager
     scene = spectral_scene(data)
     if scene is not None:  # remarks name settings of spectral methods
-        _judge_training_views(trainer, scene, console, record.steps)
+        _judge_training_views(trainer, scene, console, record)
         num_pixels = int(data.metadata().get("num_train_pixels", 0))
         few = remark_on_passes(record.total_rays, num_pixels)
         for remark in [*remarks_on_course(trainer.run.metrics_path), *few]:
             say(console, remark)
 
 
-def _judge_training_views(trainer: Trainer, scene: Scene, console: Console, steps: int) -> None:
+def _judge_training_views(trainer: Trainer, scene: Scene, console: Console, done: TrainingRecord) -> None:
     """Say, here and in run.log, which training views do not fit the others, and what the materials do not explain;
     keep how far the scene is off."""
     from unmix_plugin.commands.reporting import say, working
@@ -218,14 +219,15 @@ def _judge_training_views(trainer: Trainer, scene: Scene, console: Console, step
         views = list(thinned_views(trained, measured))
         fits = [fit for fit in map(fit_of_view, views) if fit is not None]
         misfits = write_fits(run.path, fits)
-        unexplained = find_unexplained(trained, [view for view in views if view.name not in misfits])
+        kept = [view for view in views if view.name not in misfits]
+        unexplained = find_unexplained(trained, kept, done.total_rays)
         remarks = describe_misfits(misfits)
         if unexplained is not None:
             write_unexplained(run.path, unexplained, trained.materials)
             remarks += unexplained.in_words(run.path)
         settings = trainer.config.pipeline.model
         are_given = isinstance(settings, UnmixModelConfig) and settings.endmember_init == "file"
-        write_errors(run.path, measure_errors(trained, views, are_given=are_given), steps)
+        write_errors(run.path, measure_errors(trained, views, are_given=are_given), done.steps)
     for remark in remarks:
         say(console, f"warning: {remark}")
         write_event(run, remark)

@@ -17,7 +17,7 @@ Notation: `C` cells, `P` pixels, `B` bands, `K` materials.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -42,6 +42,8 @@ FILE_NAME, SPECTRA_NAME = "unexplained.json", "unexplained.csv"
 """In the folder of a run, beside the map."""
 _WHOLE_OPACITY = 0.9
 """Opacity from which a ray ends on one place."""
+_FEWEST_RAYS = 3
+"""For each pixel of the views: seven false patches were named after 0.6, one after 2, none after 9."""
 _FEWEST_VIEWS = 3
 """That have to see a cell."""
 _DARK = 0.1
@@ -108,8 +110,13 @@ class Unexplained:
         return [*sentences, remedy] if sentences else []
 
 
-def find_unexplained(trained: TrainedScene, views: Iterable[ThinnedView]) -> Unexplained | None:
-    """Judge the surface by what the views measured; None where too little of it is seen by enough views."""
+def find_unexplained(
+    trained: TrainedScene, views: Sequence[ThinnedView], num_rays: int | None = None
+) -> Unexplained | None:
+    """Judge the surface by what the views measured; None where too little of it is seen by enough views, or was trained
+    by so few rays (of all steps) that endmembers have not settled: what they leave then says nothing of the scene."""
+    if num_rays is not None and num_rays < _FEWEST_RAYS * sum(view.counts.size for view in views):
+        return None
     spectra, points, sizes, numbers = [], [], [], []
     for number, view in enumerate(views):
         ends = view.counts & ~view.blown_out & (view.opacity > _WHOLE_OPACITY)
