@@ -46,10 +46,10 @@ _BYTES_OF = {"{": 200, "[": 80, ",": 60}
 _MOST_TAGS = 1 << 21
 """Of one XML text, opening and closing ones."""
 
-_FREE_BYTES = 1 << 28
+FREE_BYTES = 1 << 28
 """Decoded bytes that any file may have, however small it is."""
 
-_MOST_RATIO = 100
+MOST_RATIO = 100
 """Decoded bytes a stored byte of larger ones. Spectra compress by less than ten; masks by more, but these are small."""
 
 _ZIP_END_BYTES, _ZIP_ENTRY_BYTES = 1 << 17, 512
@@ -105,11 +105,11 @@ def allow_decoded(path: Path, decoded: int, kind: type[UnmixError], stored: int 
     """Ask before something compressed is decoded to so many bytes; stored in so many, by default those of the whole
     file. Raises UnmixError: of this kind: it is small in the file and huge in memory."""
     size = path.stat().st_size if stored is None else stored
-    if decoded > _LARGEST_ARRAY or decoded > max(_FREE_BYTES, _MOST_RATIO * size):
+    if decoded > _LARGEST_ARRAY or decoded > max(FREE_BYTES, MOST_RATIO * size):
         refuse(
             path,
             f"{size:,} bytes decode to {decoded:,}",
-            f"at most {_FREE_BYTES:,}, or {_MOST_RATIO} times what is stored",
+            f"at most {FREE_BYTES:,}, or {MOST_RATIO} times what is stored",
             kind,
         )
 

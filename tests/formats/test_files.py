@@ -162,6 +162,6 @@ def test_a_path_too_long_for_windows_is_said_to_be_that(tmp_path, monkeypatch, w
         writes(tmp_path / "file" / "name")
     with pytest.raises(RunError, match="File name too long; choose a shorter name"):
         write_file(tmp_path / ("a" * 256), b"")
-    monkeypatch.setattr(atomic_files, "_LONGEST_PATH", 12)
+    monkeypatch.setattr(atomic_files, "LONGEST_PATH", 12)
     with pytest.raises(RunError, match="more than 12 letters: choose a shorter folder, or turn on"):
         writes(tmp_path / "file" / "name")

@@ -23,7 +23,6 @@ from unmix_plugin.model import UnmixModel
 from unmix_plugin.poses import refinement as pose_refinement
 from unmix_plugin.poses.knots import Knots, row_waves
 from unmix_plugin.poses.refinement import LARGEST_RATIO, LARGEST_STEP, PoseRefinement, _RobustWeights
-from unmix_plugin.poses.training import PoseTraining
 from unmix_plugin.sensors.views import MeasuredPixels
 from unmix_plugin.settings import PoseConfig
 
@@ -161,9 +160,10 @@ def test_a_shift_counts_by_the_distance_to_the_middle_of_the_scene():
     assert float(moved[0]) > 0.1
 
 
-def refining_model() -> UnmixModel:
+def refining_model(refinement: PoseConfig | None = None) -> UnmixModel:
     torch.manual_seed(0)
-    config = replace(CONFIG, poses="refine", pose_refinement=PoseConfig(start=0.0, coarse_until=0.5))
+    refinement = refinement or PoseConfig(start=0.0, coarse_until=0.5)
+    config = replace(CONFIG, poses="refine", pose_refinement=refinement)
     model: UnmixModel = config.setup(scene_box=BOX, metadata=make_model().metadata)
     places = torch.tensor([[0.0, 0.0, 4.0], [4.0, 0.0, 0.0], [0.0, 4.0, 0.0]])
     with torch.no_grad():
@@ -295,13 +295,10 @@ def test_a_pose_that_fits_again_is_an_inlier_again():
 
 def gradients(weight: float) -> tuple[torch.Tensor, torch.Tensor]:
     """Of the scene and of the poses, where the pixels of one view weigh this much."""
-    poses: Any = refinement()
+    model: Any = refining_model(PoseConfig(start=0.0, coarse_steps=0)).train()
+    model.generator, poses = torch.Generator().manual_seed(0), model.poses
     poses.robust.weights.fill_(weight)
-    model: Any = make_model().train()
-    model.generator = torch.Generator().manual_seed(0)
-    model.poses = poses
-    model._pose_training = PoseTraining(PoseConfig(start=0.0, coarse_steps=0), poses)
-    model._pose_training.begin_step(0, 0.0, model.field)
+    model.get_training_callbacks()[0].func(1, 0.0)
     views, coords = some_pixels(0)
     pixels = [MeasuredPixels(None, 50, torch.zeros(50, 5), torch.ones(50), torch.arange(50))]
     step = model.training_batch(cameras().generate_rays(views, coords), pixels)

@@ -160,8 +160,8 @@ HOSTILE: dict[str, tuple[Callable[[Path], object], str]] = {
 
 @pytest.mark.parametrize("name", HOSTILE)
 def test_what_would_take_endless_work_is_refused_before_it_is_decoded(tmp_path, monkeypatch, name):
-    monkeypatch.setattr(limits, "_FREE_BYTES", 1 << 19)
-    monkeypatch.setattr(limits, "_MOST_RATIO", 1)
+    monkeypatch.setattr(limits, "FREE_BYTES", 1 << 19)
+    monkeypatch.setattr(limits, "MOST_RATIO", 1)
     monkeypatch.setattr(limits, "MOST_PARTS", 100)
     write, message = HOSTILE[name]
     write(tmp_path / name)

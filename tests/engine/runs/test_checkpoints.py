@@ -53,7 +53,7 @@ def failing_at(number: int, error: type[BaseException]) -> Iterator[list[str]]:
         return call
 
     with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setattr(atomic_files, "_CHUNK_BYTES", 200)
+        monkeypatch.setattr(atomic_files, "CHUNK_BYTES", 200)
         for name in ("open", "write", "fsync", "replace", "unlink"):
             monkeypatch.setattr(os, name, wrapped(name, getattr(os, name)))
         yield calls

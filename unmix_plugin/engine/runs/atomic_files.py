@@ -14,10 +14,10 @@ from pathlib import Path
 from unmix_plugin.engine.runs.replacing import drop_claim, put_in_place, temporary_name
 from unmix_plugin.errors import RunError
 
-_CHUNK_BYTES = 1 << 26
+CHUNK_BYTES = 1 << 26
 """Bytes handed to one write."""
 
-_LONGEST_PATH = 259 if os.name == "nt" else None
+LONGEST_PATH = 259 if os.name == "nt" else None
 """Letters of a path, where Windows has not been told to take long ones; its error is that of a missing folder."""
 
 ADVICE = {
@@ -106,7 +106,7 @@ def write_file(path: Path, data: bytes) -> Path:
 def write_all(descriptor: int, data: memoryview) -> None:
     """Write all bytes of `data`."""
     while len(data) > 0:
-        data = data[os.write(descriptor, data[:_CHUNK_BYTES]) :]
+        data = data[os.write(descriptor, data[:CHUNK_BYTES]) :]
 
 
 def make_folder(path: Path) -> Path:
@@ -138,9 +138,9 @@ def cannot_write(path: Path, reason: str) -> RunError:
 
 def _too_long(path: Path) -> str:
     """What to do about a path that is too long for Windows; empty for others."""
-    if _LONGEST_PATH is None or len(str(path.absolute())) <= _LONGEST_PATH:
+    if LONGEST_PATH is None or len(str(path.absolute())) <= LONGEST_PATH:
         return ""
-    return f"; the path has more than {_LONGEST_PATH} letters: choose a shorter folder, or turn on long paths"
+    return f"; the path has more than {LONGEST_PATH} letters: choose a shorter folder, or turn on long paths"
 
 
 def _sync(path: Path, flags: int) -> None:
