@@ -7,7 +7,7 @@ published need are annotated with `Unlisted`: they work as flags, but no help li
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
@@ -200,10 +200,10 @@ class LossConfig(Settings):
     """Power of a pixel's brightness by which squared errors of its spectrum are divided: 0 for absolute errors, 2 for
     relative ones. Auto is 0 unless alpha is known and the brighter pixels are much brighter than the others."""
 
-    def rules(self) -> Sequence[Check]:
+    def rules(self) -> Iterator[Check]:
         """Weights of bands that count."""
         are_weights = self.band_weights == "auto" or all(weight > 0 for weight in self.band_weights)
-        return (Check("band_weights", "above 0, auto or none", are_weights),)
+        yield Check("band_weights", "above 0, auto or none", are_weights)
 
 
 @dataclass(frozen=True)
@@ -274,38 +274,36 @@ class UnmixModelConfig(ModelConfig):
     losses: LossConfig = LossConfig()
     """What training asks for, and how strongly."""
 
-    def rules(self) -> Sequence[Check]:
+    def rules(self) -> Iterator[Check]:
         """What belongs together: a lamp and light that moves, endmembers and their file, and what is as published."""
         ours = not self.as_published
         has_lamp, has_file = self.lamp not in ("auto", ()), self.endmember_file is not None
         is_lamp = len(self.lamp) == _LAMP_NUMBERS and self.lamp[0] in (0, 1)
         is_lamp = is_lamp and all(any(self.lamp[first : first + 3]) for first in (4, 7))
-        return (
-            Check(
-                ("lamp",),
-                "a lamp of no or ten numbers, the first 0 or 1, axis and way not 0, or auto",
-                not has_lamp or is_lamp,
-            ),
-            Check(
-                ("light", "lamp"),
-                "light camera where numbers of a lamp are given",
-                not has_lamp or self.light == "camera",
-            ),
-            Check(
-                "light",
-                "fixed or per-view: the field as published has no shading",
-                ours or self.light != "camera",
-            ),
-            Check(
-                (),
-                "a scale per-endmember: the method as published has no shared one",
-                ours or self.field.scale == "per-endmember",
-            ),
-            Check(
-                ("endmember_init", "endmember_file"),
-                "endmember-file exactly when endmember-init is file",
-                (self.endmember_init == "file") == has_file,
-            ),
+        yield Check(
+            ("lamp",),
+            "a lamp of no or ten numbers, the first 0 or 1, axis and way not 0, or auto",
+            not has_lamp or is_lamp,
+        )
+        yield Check(
+            ("light", "lamp"),
+            "light camera where numbers of a lamp are given",
+            not has_lamp or self.light == "camera",
+        )
+        yield Check(
+            "light",
+            "fixed or per-view: the field as published has no shading",
+            ours or self.light != "camera",
+        )
+        yield Check(
+            (),
+            "a scale per-endmember: the method as published has no shared one",
+            ours or self.field.scale == "per-endmember",
+        )
+        yield Check(
+            ("endmember_init", "endmember_file"),
+            "endmember-file exactly when endmember-init is file",
+            (self.endmember_init == "file") == has_file,
         )
 
     def resolve_auto(

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, make_dataclass, replace
 from functools import cache
 from importlib import import_module
@@ -127,9 +127,9 @@ class Settings:
         if broken := [check.broken(self) for check in (*checks, *self.rules()) if not check.holds]:
             raise ConfigError(f"{self._called} needs {' and '.join(broken)}")
 
-    def rules(self) -> Sequence[Check]:
+    def rules(self) -> Iterator[Check]:
         """What else must hold; a subclass adds to those of its base."""
-        return ()
+        yield from ()
 
 
 @dataclass(frozen=True)
@@ -278,20 +278,18 @@ class TrainerConfig(Settings):
     optimizers: tyro.conf.Suppress[Mapping[str, OptimizerConfig]] = field(default_factory=dict)
     """Settings of the optimiser by parameter group."""
 
-    def rules(self) -> Sequence[Check]:
+    def rules(self) -> Iterator[Check]:
         """A limit, a seed that torch takes, and a name that a folder can have."""
-        return (
-            Check(
-                ("max_num_iterations", "max_seconds"),
-                "max-num-iterations or max-seconds",
-                (self.max_num_iterations, self.max_seconds) != (None, None),
-            ),
-            Check("seed", "of -2^63 to 2^63 - 1", -(2**63) <= self.seed < 2**63),
-            Check(
-                ("method_name",),
-                "a file name as method-name",
-                bool(self.method_name) and "/" not in self.method_name,
-            ),
+        yield Check(
+            ("max_num_iterations", "max_seconds"),
+            "max-num-iterations or max-seconds",
+            (self.max_num_iterations, self.max_seconds) != (None, None),
+        )
+        yield Check("seed", "of -2^63 to 2^63 - 1", -(2**63) <= self.seed < 2**63)
+        yield Check(
+            ("method_name",),
+            "a file name as method-name",
+            bool(self.method_name) and "/" not in self.method_name,
         )
 
     def progress(self, steps: int, seconds: float) -> float:

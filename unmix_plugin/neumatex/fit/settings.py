@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -153,11 +153,11 @@ class NeumatexModelConfig(ModelConfig):
     """Tone curve through which pictures of linear light are compared in training; others are compared as they are. Auto
     is agx for colours; for bands light over the lamp's power, its logarithm above 1, so that dim bands count too."""
 
-    def rules(self) -> Sequence[Check]:
+    def rules(self) -> Iterator[Check]:
         """A run to start from is one of mixed spectra."""
         is_spectral = self.material in ("spectral", "auto")
         rule = "from-run with the material spectral only"
-        return (Check(("material", "from_run"), rule, self.from_run is None or is_spectral),)
+        yield Check(("material", "from_run"), rule, self.from_run is None or is_spectral)
 
     def resolve_auto(
         self, initial_data: Callable[[], Mapping[str, np.ndarray]], generator: torch.Generator
