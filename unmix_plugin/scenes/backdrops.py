@@ -184,8 +184,11 @@ def judge_backdrop(
     """
     if len(sample) < _NUM_FEATURES:
         return None
-    basis = _basis(np.clip(sample, 0.0, 1.0))
-    brightest = float(np.percentile(norm(np.clip(sample, 0.0, 1.0)), _BRIGHT_PERCENTILE))
+    sample = np.clip(sample, 0.0, 1.0)
+    # Directions in which spectra reach farthest from 0.
+    _, vectors = np.linalg.eigh(sample.T.astype(np.float64) @ sample)
+    basis = np.ascontiguousarray(vectors[:, ::-1][:, :_NUM_FEATURES], np.float32)
+    brightest = float(np.percentile(norm(sample), _BRIGHT_PERCENTILE))
     if brightest <= 0:
         return None
     features, known = zip(*((np.asarray(image @ basis), mask) for image, mask in views), strict=True)
@@ -229,13 +232,6 @@ def judge_backdrop(
         return None
     spectrum = found.spectra(np.median(levels_shown, axis=0).astype(np.float32))
     return replace(found, spectrum=spectrum.clip(min=0))
-
-
-def _basis(sample: Float32[np.ndarray, "N B"]) -> Float32[np.ndarray, "B k"]:
-    """Directions in which spectra reach farthest from 0."""
-    moments = sample.T.astype(np.float64) @ sample
-    _, vectors = np.linalg.eigh(moments)
-    return np.ascontiguousarray(vectors[:, ::-1][:, :_NUM_FEATURES], np.float32)
 
 
 def _stripes(features: Sequence[Float32[np.ndarray, "h W k"]]) -> Float32[np.ndarray, "W k"]:

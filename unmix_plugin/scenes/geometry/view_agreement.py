@@ -182,7 +182,10 @@ def _compare(
     generator = torch.Generator().manual_seed(0)
     used = sorted({*neighbours, *(other for others in neighbours.values() for other in others)})
     thinned = ThinnedViews(views, most_pooled=1)
-    read = [_with_gaps(thinned, view) for view in used]
+    read = []
+    for view in used:
+        image, share = thinned.read(view), thinned.valid_share(view)
+        read.append(image if share is None else image.masked_fill((share < 1)[..., None], torch.nan))
     if not any(bool(image.isfinite().any()) for image in read):
         return None
     images = view_features(read, generator)
@@ -195,12 +198,6 @@ def _compare(
     if not chance > 0.0:  # NaN where no pixel counts
         return None
     return _Comparison(neighbours, features, pixels, thinned.cameras(images[0]), chance)
-
-
-def _with_gaps(thinned: ThinnedViews, view: int) -> Float[Tensor, "h w B"]:
-    """A view thinned out, NaN where pixels don't count."""
-    image, share = thinned.read(view), thinned.valid_share(view)
-    return image if share is None else image.masked_fill((share < 1)[..., None], torch.nan)
 
 
 def _meanings(poses: _Poses) -> dict[str, _Poses]:
