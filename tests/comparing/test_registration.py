@@ -46,18 +46,25 @@ def test_a_fixed_scale_is_taken_as_given(surface):
         register(surface, moved, PIXEL, "fixed", 1.0)
 
 
+def part_of(surface, kept: np.ndarray):
+    """Some vertices of a surface."""
+    names = ("positions", "normals", "areas", "spectra", "abundances")
+    parts = {name: getattr(surface, name)[kept] for name in names}
+    return replace(surface, **parts, faces=np.zeros((0, 3), np.int64))
+
+
 def test_a_part_of_the_object_is_found_on_the_whole(surface):
-    kept = np.flatnonzero(surface.positions[:, 2] > -0.35)
-    part = replace(
-        surface,
-        **{
-            name: getattr(surface, name)[kept]
-            for name in ("positions", "normals", "areas", "spectra", "abundances")
-        },
-        faces=np.zeros((0, 3), np.int64),
-    )
-    found = register(part, surface, PIXEL)
+    found = register(part_of(surface, surface.positions[:, 2] > -0.35), surface, PIXEL)
     assert rms_px(found.to_before, Similarity.identity(), surface.positions) < 0.2
+
+
+@pytest.mark.parametrize("scale", ["free", "fixed"])
+def test_captures_of_different_sides_are_refused(surface, scale):
+    """Whatever similarity lays one side on the other, it is not the same object there."""
+    upper = part_of(surface, surface.positions[:, 2] > 0.25)
+    lower = part_of(surface, surface.positions[:, 2] < -0.25)
+    with pytest.raises(ConfigError, match="can't be laid on each other"):
+        register(upper, in_world(lower, MOVED), PIXEL, scale, 1 / MOVED.scale)
 
 
 def test_other_objects_and_other_materials_are_refused(surface):
