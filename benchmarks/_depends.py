@@ -58,6 +58,7 @@ DEPENDS_ON: dict[str, tuple[str, ...]] = {
     ),
     "resume": ("engine",),
     "rig": ("sensors", "light", "model.py"),
+    "splats": ("products/splat_fit.py", "products/splats.py", "operators/splatting.py"),
     "spoilt_views": ("captures",),
     "store": ("scenes", "datamanager.py"),
     "subspace": ("spectral",),

@@ -4,8 +4,8 @@
 
 Exports mesh and splats of a run. The engine of PlayCanvas loads the splats in Chromium (software rendering) as PLY and
 as glTF, through a camera of the scene; its picture is compared with `unmix-render`'s. The reader of SuperSplat
-(splat-transform) turns the PLY into a table, whose numbers are compared with the mesh's. The Khronos validator checks
-both GLB files. Fetches these programs with npm once; without npm or the network it says so and measures nothing.
+(splat-transform) turns the PLY into a table, whose numbers are compared with another reader's. The Khronos validator
+checks both GLB files. Fetches these programs with npm once; without npm or the network it says so and measures nothing.
 """
 
 from __future__ import annotations
@@ -211,7 +211,7 @@ def page_of(scene: Any, camera: Any) -> str:
 
 
 def table(folder: Path, packages: Path) -> dict[str, Any]:
-    """What SuperSplat's reader takes from the PLY, against the mesh that it was made of."""
+    """What SuperSplat's reader takes from the PLY, against another reader."""
     words = [shutil.which("node") or "node", str(packages / ".bin" / "splat-transform"), "-w"]
     written = folder / "splats.csv"
     _common.run_command([*words, str(folder / "z" / "splats.ply"), str(written)])

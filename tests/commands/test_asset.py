@@ -12,7 +12,16 @@ from tests.factories.objects import CENTRE, LAMP, WAVELENGTHS, write_spectral_ob
 from unmix_plugin.commands.asset import asset
 from unmix_plugin.neumatex.tracing.light_files import read_exr
 
-FILES = ("material.glb", "material.json", "abundances.exr", "endmembers.csv", "environment.exr", "page.html")
+FILES = (
+    "material.glb",
+    "material.json",
+    "abundances.exr",
+    "endmembers.csv",
+    "environment.exr",
+    "page.html",
+    "splats.glb",
+    "splats.ply",
+)
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +38,7 @@ def small(ball):
         (ball / name).unlink()
     words = ["--data", ball, "--output", ball.parent / "made", "--output-dir", ball.parent / "out"]
     words += ["--field-seconds", 4, "--material-seconds", 1, "--endmembers", 2, "--mesh-triangles", 400]
-    return [*words, "--texture-size", 256, "--page-resolution", 32, "--device", "cpu"]
+    return [*words, "--texture-size", 256, "--page-resolution", 32, "--splat-steps", 5, "--device", "cpu"]
 
 
 @pytest.mark.slow
@@ -43,8 +52,8 @@ def test_all_files_are_there_and_the_manifest_says_what_they_are(made):
     assert content["figures"]["relit_psnr"] > 5
     assert "per_image" not in content["figures"]
     assert {each["subject"] for each in content["decisions"]} == {"mesh", "light"}
-    for step in range(1, 6):
-        assert f"[{step}/5]" in ended.out
+    for step in range(1, 7):
+        assert f"[{step}/6]" in ended.out
     assert "unmix-train neumatex --from-run" in ended.out
 
 
@@ -77,7 +86,7 @@ def test_a_capture_is_made_a_scene_first_with_the_options_of_unmix_process(tmp_p
         f"unmix-process unmix-nerf --data {tmp_path / 'ball'} --output-dir {scene} --drop-bands 600"
         in ended.out
     )
-    assert "[6/6]" in ended.out
+    assert "[7/7]" in ended.out
     assert (tmp_path / "made" / "asset.json").is_file()
     assert "holds a scene already" in refused(asset, "unmix-nerf", *words, "--output", tmp_path / "other")
 

@@ -237,21 +237,31 @@ def test_points_and_mesh_lie_where_the_scene_is(solid, exported):
         assert f"lengths in {name}.glb are in units of the scene, of unknown size" in said
 
 
-def test_splats_are_flat_upright_and_as_dense_as_the_surface(exported):
+def test_both_files_of_splats_hold_the_same_gaussians(exported):
     ply = PlyData.read(exported[0] / "splats" / "splats.ply")["vertex"]
-    content = json_of(exported[0] / "splats" / "splats.glb")
-    primitive = content["meshes"][0]["primitives"][0]
+    path = exported[0] / "splats" / "splats.glb"
+    content = json_of(path)
+    [primitive] = content["meshes"][0]["primitives"]
     assert (primitive["mode"], content["extensionsUsed"]) == (0, ["KHR_gaussian_splatting"])
-    assert content["accessors"][primitive["attributes"]["POSITION"]]["count"] == len(ply["x"])
+    binary = path.read_bytes()[28 + int.from_bytes(path.read_bytes()[12:16], "little") :]
+
+    def column(name):
+        accessor = content["accessors"][primitive["attributes"][name]]
+        start = content["bufferViews"][accessor["bufferView"]]["byteOffset"]
+        width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]]
+        return np.frombuffer(binary, "<f4", accessor["count"] * width, start).reshape(-1, width)
+
+    own = "KHR_gaussian_splatting"
+    opacities = column(f"{own}:OPACITY")[:, 0]
+    np.testing.assert_allclose(np.log(opacities / (1 - opacities)), ply["opacity"], rtol=1e-3, atol=1e-3)
     sizes = np.exp(np.stack([ply[f"scale_{axis}"] for axis in range(3)], axis=1))
-    np.testing.assert_allclose(sizes[:, 2] / sizes[:, 0], 0.1, rtol=1e-4)
-    # As many as cover the surface of the mesh of the same resolution, neighbours overlapping by half.
-    mesh = loaded_mesh(exported[0] / "mesh" / "mesh.ply")
-    assert (sizes[:, 0] ** 2).sum() == pytest.approx(0.75**2 * mesh.area, rel=0.02)
-    # The third axis is the normal, and the scene's up, +z, is -y.
-    w, x, y, z = (ply[f"rot_{index}"] for index in range(4))
-    normals = PlyData.read(exported[0] / "mesh" / "mesh.ply")["vertex"]["nz"]
-    np.testing.assert_allclose(2 * (y * z - x * w), -normals, atol=1e-4)
+    np.testing.assert_allclose(column(f"{own}:SCALE"), sizes, rtol=1e-4)
+    harmonics = np.stack([ply[f"f_dc_{axis}"] for axis in range(3)], axis=1)
+    np.testing.assert_array_equal(column(f"{own}:SH_DEGREE_0_COEF_0"), harmonics)
+    shares = np.stack(
+        [ply[each.name] for each in ply.properties if each.name.startswith("abundance_")], axis=1
+    )
+    np.testing.assert_allclose(shares.sum(axis=1), 1, atol=1e-4)
 
 
 def json_of(path):

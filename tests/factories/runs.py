@@ -45,7 +45,7 @@ EXPORT_WORDS = {
     "mesh": ["--formats", "ply", "obj", "glb", "--resolution", 24],
     "page": ["--resolution", 24, "--title", "pots </script><b>"],
     "point-cloud": ["--num-points", 500],
-    "splats": ["--resolution", 24],
+    "splats": ["--megabytes", 0.05, "--steps", 20],
     "report": ["--max-views", 1],
     "spectrum": ["--view", "eval_002", "--pixel", "8,8"],
     "volume": ["--resolution", 8],

@@ -37,7 +37,7 @@ STEPS = 33
 SMALL = {
     "mesh": ["--resolution", 12],
     "page": ["--resolution", 12],
-    "splats": ["--resolution", 12],
+    "splats": ["--megabytes", 0.05, "--steps", 3],
     "point-cloud": ["--num-points", 100],
     "report": ["--max-views", 1],
     "spectrum": ["--view", "eval_002", "--pixel", "8,8"],

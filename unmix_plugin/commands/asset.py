@@ -25,7 +25,7 @@ from unmix_plugin.errors import ConfigError
 @dataclass(frozen=True)
 class _AssetOptions:
     """Make an object of a scene folder: train a field, take mesh and light from it, fit relightable materials, evaluate
-    them, and write glTF, textures of materials, the environment, a page and asset.json, which says what is what.
+    them, and write glTF, textures of materials, the environment, a page, splats, and asset.json with what each is.
 
     Before all options there may be a LAYOUT of unmix-process, as in unmix-asset cubes --data CAPTURE --white FILE: the
     scene is then made of a capture first, and all options of unmix-process are taken, too (unmix-process --help).
@@ -55,6 +55,8 @@ class _AssetOptions:
     """Width and height of the textures, texels."""
     page_resolution: int = 128
     """Vertices along the longest edge of the object in the page."""
+    splat_steps: int = 600
+    """Steps in which splats are fitted to the field."""
     output_dir: Path = Path("outputs")
     """Folder for the two runs."""
     overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -87,7 +89,7 @@ def asset(arguments: list[str]) -> None:
     numbers = count(1)
 
     def step(what: str, program: str, words: Sequence[str]) -> None:
-        number = f"{next(numbers)}/{5 + bool(of_capture)}"
+        number = f"{next(numbers)}/{6 + bool(of_capture)}"
         tell(f"\n[{number}] {what}\n{shell_line(program, *words)}")
 
     if of_capture:
@@ -113,12 +115,16 @@ def asset(arguments: list[str]) -> None:
     evaluate(words)
 
     folder = (options.output or run.exports / "asset").resolve()
-    common = [*words, "--output", str(folder), *(["--overwrite"] if options.overwrite else [])]
+    into = ["--output", str(folder), *(["--overwrite"] if options.overwrite else [])]
+    common = [*words, *into]
     words = ["material", *common, "--texture-size", str(options.texture_size)]
     step("glTF and textures", "unmix-export", words)
     export(words)
     words = ["page", *common, "--resolution", str(options.page_resolution)]
     step("a page in 3-D", "unmix-export", words)
+    export(words)
+    words = ["splats", "--run", str(field), *device, *into, "--steps", str(options.splat_steps)]
+    step("splats that look like the field", "unmix-export", words)
     export(words)
     manifest = _write_manifest(folder, field, run.path)
     tell(f"\nobject: {folder / 'material.glb'}, {folder / 'page.html'}")
@@ -180,6 +186,8 @@ def _write_manifest(folder: Path, field: Path, path: Path) -> Path:
             "abundances.exr": "abundances of the endmembers of endmembers.csv, a channel each, as a texture",
             _ENVIRONMENT: about,
             "page.html": "the object in 3-D under any light",
+            "splats.glb": "Gaussians in the light of the pictures, KHR_gaussian_splatting, with abundances",
+            "splats.ply": "the same for viewers of splats, -y up",
         },
         "metres_per_unit": None if loaded.scale is None else loaded.scale.metres_per_unit,
         "runs": {"field": str(field), "materials": str(path)},

@@ -253,9 +253,9 @@ class Gaussians:
     scales: Float32[np.ndarray, "P 3"]
     """Standard deviation along each axis."""
     srgb: Float32[np.ndarray, "P 3"]
-    """[0, 1]."""
-    opacity: float
-    """At every centre, (0, 1)."""
+    """[0, 1]; also beyond, where that is what fits."""
+    opacities: Float32[np.ndarray, " P"]
+    """At the centres, (0, 1)."""
 
     @property
     def _constant_harmonics(self) -> Float32[np.ndarray, "P 3"]:
@@ -281,13 +281,12 @@ def write_splats_glb(
         Khronos Group, KHR_gaussian_splatting.
     """
     own = "KHR_gaussian_splatting"
-    opacity = np.full(len(splats.positions), splats.opacity, dtype=np.float32)
     attributes = {
         "POSITION": splats.positions,
-        "COLOR_0": np.concatenate([decode_srgb(splats.srgb), opacity[:, None]], axis=1),
+        "COLOR_0": np.column_stack([decode_srgb(splats.srgb.clip(0, 1)), splats.opacities]),
         f"{own}:ROTATION": splats.rotations,
         f"{own}:SCALE": splats.scales,
-        f"{own}:OPACITY": opacity,
+        f"{own}:OPACITY": splats.opacities,
         f"{own}:SH_DEGREE_0_COEF_0": splats._constant_harmonics,
         **numbers,
     }
@@ -300,11 +299,10 @@ def write_splats_ply(
 ) -> Path:
     """Write Gaussians with the property names of the authors' own program (Kerbl et al. 2023), which viewers read:
     logarithms of scales, the logit of the opacity, quaternions w first; `numbers` (P,) come after them."""
-    logit = np.full(len(splats.positions), np.log(splats.opacity / (1 - splats.opacity)), dtype=np.float32)
     vertices = {
         **{name: splats.positions[:, axis] for axis, name in enumerate("xyz")},
         **{f"f_dc_{axis}": splats._constant_harmonics[:, axis] for axis in range(3)},
-        "opacity": logit,
+        "opacity": np.log(splats.opacities) - np.log1p(-splats.opacities),
         **{f"scale_{axis}": np.log(splats.scales[:, axis]) for axis in range(3)},
         **{f"rot_{index}": splats.rotations[:, axis] for index, axis in enumerate((3, 0, 1, 2))},
         **numbers,

@@ -44,6 +44,23 @@ _CHUNK = 50_000
 _BISECTIONS = 20
 
 
+def even_cover(points: SurfacePoints, count: int) -> tuple[SurfacePoints, Float[np.ndarray, "kept 3"]]:
+    """At most `count` points that cover the same surface evenly, without stray ones, and their unit normals.
+
+    Raises:
+        RunError: there are no points.
+    """
+    points = points.select(torch.from_numpy(~_is_outlier(points.positions.numpy())))
+    if len(points) == 0:
+        raise RunError(
+            "no ray of the run's cameras ends on a surface: train longer, or there is nothing to export"
+        )
+    positions = points.positions.double().numpy()
+    chosen = _thinned(positions, count)
+    normals = _plane_normals(positions, -points.directions.double().numpy(), chosen)
+    return points.select(torch.from_numpy(chosen)), normals
+
+
 def _is_outlier(positions: Float[np.ndarray, "P 3"]) -> Bool[np.ndarray, " P"]:
     """Which points lie far from all others, by the mean distance to their nearest eight."""
     if len(positions) <= _OUTLIER_NEIGHBOURS:
@@ -211,18 +228,10 @@ def _write_point_cloud(
     spectrum), material (uint8), every abundance, every score and the diffuse spectrum if asked for (float32).
     """
     materials = scene.materials
-    points = points.select(torch.from_numpy(~_is_outlier(points.positions.numpy())))
-    if len(points) == 0:
-        raise RunError(
-            "no ray of the run's cameras ends on a surface: train longer, or there is nothing to export"
-        )
-    positions = points.positions.double().numpy()
-    chosen = _thinned(positions, num_points)
-    normals = _plane_normals(positions, -points.directions.double().numpy(), chosen)
-    kept = points.select(torch.from_numpy(chosen))
+    kept, normals = even_cover(points, num_points)
     diffuse = kept.diffuse(materials)
     looks = SurfaceAppearance(materials, kept.abundances, diffuse, scene.scale)
-    world = positions_for_files(frame.to_world(positions[chosen]))
+    world = positions_for_files(frame.to_world(kept.positions.double().numpy()))
     turned = directions_to_world(frame, normals).astype(np.float32)
     vertices = {
         **xyz_columns(world),
@@ -245,4 +254,4 @@ def _write_point_cloud(
         else:
             named, said = with_scalar_fields(vertices, comments)
             write_ply(path, named, comments=said)
-    return len(chosen)
+    return len(kept)

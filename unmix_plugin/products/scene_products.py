@@ -214,13 +214,15 @@ class Spectrum(_ComparedProduct):
 
 @dataclass(frozen=True)
 class Splats(Product):
-    """The surface as Gaussians for splat viewers: splats.glb (KHR_gaussian_splatting) and splats.ply, one flat Gaussian
-    for each piece of the surface, in the colour that cameras see, with its material and every abundance."""
+    """Gaussians fitted to what the run renders, for splat viewers: splats.glb (KHR_gaussian_splatting) and splats.ply,
+    with material and every abundance of each."""
 
     formats: tuple[Literal["glb", "ply"], ...] = ("glb", "ply")
     """glb (up is +y), ply (up is -y, as viewers of splats expect)."""
-    resolution: int = 256
-    """Pieces along the longest edge of the scene box."""
+    megabytes: float = 6.0
+    """Size of splats.ply, in millions of bytes, at most."""
+    steps: int = 600
+    """Of the fit; more are slower and nearer to what the run renders. 0: discs on the surface."""
     up: Literal["y", "z"] = "y"
     """z: axes stay those of the scene's world."""
 

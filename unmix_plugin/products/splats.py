@@ -1,9 +1,6 @@
-"""The surface as Gaussians, for viewers of splats: nothing is fitted, each vertex of the exported surface becomes one.
+"""Gaussians that look like the run, for viewers of splats: their fit is `splat_fit`, their files are made here.
 
-A Gaussian is flat along the surface, a tenth as thick as it is wide, and so wide that neighbours overlap without a gap:
-its standard deviation is the edge of the square that has the vertex's share of the area.
-
-Notation: `V` vertices, one Gaussian each.
+Notation: `P` Gaussians.
 """
 
 from __future__ import annotations
@@ -14,46 +11,54 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float
-from trimesh import triangles
+from scipy.spatial.transform import Rotation
 
+from unmix_plugin.errors import ConfigError
 from unmix_plugin.formats.meshes import Gaussians, least_turns, write_splats_glb, write_splats_ply
 from unmix_plugin.products.mesh import gltf_content, say_units
 from unmix_plugin.products.product import Job
 from unmix_plugin.products.scene_products import Splats
-from unmix_plugin.trained.run_views import directions_to_world, positions_for_files, world_up
-from unmix_plugin.trained.surface import SurfaceAppearance, look_at
-from unmix_plugin.trained.surface_mesh import TriangleMesh, surface_of, vertex_areas
+from unmix_plugin.products.splat_fit import fit_splats, seen_splats, start_splats
+from unmix_plugin.trained.run_views import positions_for_files, world_up
+from unmix_plugin.trained.surface import SurfaceAppearance
+from unmix_plugin.trained.surface_mesh import TriangleMesh
 
-_WIDTH = 0.75
-"""Standard deviation along the surface, relative to the square root of the vertex's area."""
-_THICKNESS = 0.1
-_OPACITY = 0.98
-_WHAT = "surface of an unmix-nerf run as Gaussians"
+_BYTES = 4 * (14 + 1)
+"""Of a Gaussian in PLY, with its material, before abundances of 4 bytes each."""
+_MEGABYTES, _MOST_STEPS = (0.01, 1000.0), 100_000
+_WHAT = "Gaussians fitted to an unmix-nerf run"
 
 
 def export(job: Job, asked: Splats) -> list[Path]:
-    """Find the surface and make a Gaussian of each of its vertices."""
+    """Find the surface, fit Gaussians that start on it, and write those that are seen."""
+    low, high = _MEGABYTES
+    if not low <= asked.megabytes <= high:
+        raise ConfigError(f"--megabytes is {asked.megabytes:g}; choose {low:g} to {high:g}")
+    if not 0 <= asked.steps <= _MOST_STEPS:
+        raise ConfigError(f"--steps is {asked.steps}; choose 0 to {_MOST_STEPS}")
     paths = {kind: job.folder / f"splats.{kind}" for kind in asked.formats}
     job.claim(list(paths.values()))
-    scene, frame = job.scene, job.frame
-    mesh, _ = surface_of(scene, asked.resolution, follow=job.follow, working=job.working)
-    with job.working("looking at the surface's points"):
-        normals = mesh.normals
-        seen = look_at(
-            scene, torch.from_numpy(mesh.vertices).float(), torch.from_numpy(-normals).float()
-        ).map(lambda packed: packed.cpu() / packed[:, :1].clamp(min=1e-6).cpu())
-        materials = job.materials.to("cpu")  # gloss from straight above included
-        looks = SurfaceAppearance(materials, seen.abundances, materials.spectra(seen), scene.scale)
-    world = TriangleMesh(positions_for_files(frame.to_world(mesh.vertices)), mesh.faces)
-    positions, numbers, extras = gltf_content(world, looks, _WHAT)
-    areas = vertex_areas(triangles.area(world.vertices[mesh.faces]), mesh.faces, len(world.vertices))
-    widths = _WIDTH * np.sqrt(np.maximum(areas, 0.01 * np.mean(areas)))
+    scene, frame, materials = job.scene, job.frame, job.materials.to("cpu")
+    count = int(1e6 * asked.megabytes / (_BYTES + 4 * len(materials.names)))
+    fitted = start_splats(scene, count, job.follow)
+    if asked.steps > 0:
+        generator = torch.Generator().manual_seed(0)
+        fitted = fit_splats(scene, fitted, asked.steps, generator, job.follow)
+    fitted, seen = seen_splats(scene, fitted, job.follow)
+
+    looks = SurfaceAppearance(materials, seen.abundances, materials.spectra(seen), scene.scale)
+    places = frame.to_world(fitted.positions.double().numpy())
+    no_faces = np.zeros((0, 3), dtype=np.int64)
+    positions, numbers, extras = gltf_content(
+        TriangleMesh(positions_for_files(places), no_faces), looks, _WHAT
+    )
+    to_world = Rotation.from_matrix(frame.rotation.T)
     splats = Gaussians(
         positions,
-        least_turns(np.eye(3)[2:], directions_to_world(frame, normals)).astype(np.float32),
-        np.stack([widths, widths, _THICKNESS * widths], axis=1).astype(np.float32),
-        looks.srgb.astype(np.float32),
-        _OPACITY,
+        (to_world * Rotation.from_quat(fitted.rotations.numpy())).as_quat().astype(np.float32),
+        fitted.log_scales.exp().numpy() / np.float32(frame.scale),
+        fitted.srgb.numpy(),
+        torch.sigmoid(fitted.opacity_logits).clamp(max=1 - 1e-6).numpy(),
     )
     axis = world_up(scene.views, frame) if asked.up == "y" else np.array([0.0, 1.0, 0.0])
     if "glb" in paths:
@@ -75,8 +80,6 @@ def export(job: Job, asked: Splats) -> list[Path]:
 
 def _turned(splats: Gaussians, up: Float[np.ndarray, "3"]) -> Gaussians:
     """The same with `up` turned to -y."""
-    from scipy.spatial.transform import Rotation
-
     turn = Rotation.from_quat(least_turns(up, np.array([0.0, -1.0, 0.0])))
     return replace(
         splats,
