@@ -18,8 +18,9 @@ _WIDTH, _HEIGHT, _MARGIN, _LINE = 8.27, 11.69, 0.7, 0.21
 """A4, inches."""
 _LETTERS = 96
 """In a line."""
-_COLUMNS = (0.0, 0.3, 1.1, 2.25, 3.75, 4.4, 4.9)
-_MOST_ROWS = 30
+_COLUMNS = (0.0, 0.3, 1.4, 3.2, 5.2, 6.0)
+_MOST_ROWS = 18
+"""Of places, two lines each, with room for notes above them."""
 
 
 def printed_report(comparison: Comparison, views: Sequence[ShownView], maps: Sequence[ChangeMap]) -> bytes:
@@ -61,7 +62,7 @@ def _first_page(comparison: Comparison):  # noqa: ANN202 - a figure of matplotli
             line(row)
             top -= _LINE
     top -= _LINE
-    heads = ("", "what", "area", "centre", "p", "angle", "by how much")
+    heads = ("", "what", "area", "centre", "p", "angle, rad")
     for left, text in zip(_COLUMNS, heads, strict=True):
         line(text, 8, left, fontweight="bold")
     for place in comparison.places[:_MOST_ROWS]:
@@ -73,10 +74,11 @@ def _first_page(comparison: Comparison):  # noqa: ANN202 - a figure of matplotli
             " ".join(f"{value:.3g}" for value in place.center),
             f"{place.p:.2g}",
             f"{place.angle:.3f}",
-            amount_in_words(comparison, place.number),
         )
         for left, text in zip(_COLUMNS, cells, strict=True):
             line(text, 8, left)
+        top -= 0.75 * _LINE
+        line(amount_in_words(comparison, place.number), 8, _COLUMNS[1])
     if len(comparison.places) > _MOST_ROWS:
         top -= _LINE
         line(f"and {len(comparison.places) - _MOST_ROWS} more in changes.csv", 8)
@@ -97,7 +99,7 @@ def amount_in_words(comparison: Comparison, number: int) -> str:
     amount = place.amounts[name]
     if not amount.low * amount.high > 0:
         return text
-    change = f"{name.removeprefix('abundance ')} {amount.low:+.2f} to {amount.high:+.2f}"
+    change = f"{name.removeprefix('abundance ')} {amount.low:+.2g} to {amount.high:+.2g}"
     return f"{text}, {change}" if place.what == "brightness" else change
 
 
@@ -109,6 +111,10 @@ def _view_page(comparison: Comparison, view: ShownView, maps: Sequence[ChangeMap
     rows = -(-len(shown) // columns)
     figure = Figure(figsize=(_WIDTH, _HEIGHT), facecolor="white")
     figure.text(0.08, 0.96, plot_text(view.name), fontsize=13, fontweight="bold", va="top")
+    colours = (
+        "red is more and blue is less than before; faint where not significant, plain grey where not compared"
+    )
+    figure.text(0.08, 0.935, colours, fontsize=8, va="top")
     for index, panel in enumerate(shown):
         axes = figure.add_subplot(max(rows, 4), columns, index + 1)
         axes.imshow(np.clip(panel.image, 0, 1))

@@ -117,6 +117,11 @@ class ChangeMap:
     """After correction for all vertices."""
     scale: ColourScale
 
+    def title_with_range(self) -> str:
+        """What the colours of a figure reach."""
+        low, high = self.scale.low, self.scale.high
+        return f"{self.title} ±{high:.2g}" if low == -high else f"{self.title} {low:.2g} to {high:.2g}"
+
     def painted(self, view: ShownView, level: float) -> Picture:
         """Its colours on a view, faint where it is not significant, neutral where nothing is known."""
         values, p = view.of_pixels(self.values), view.of_pixels(self.p)
@@ -193,7 +198,9 @@ def panels(view: ShownView, comparison: Comparison, maps: Sequence[ChangeMap]) -
         TitledPicture(view.after, "after, light taken out"),
         TitledPicture(outlined(view, comparison), "places that changed"),
     ]
-    return found + [TitledPicture(one.painted(view, comparison.level), one.title) for one in maps]
+    return found + [
+        TitledPicture(one.painted(view, comparison.level), one.title_with_range()) for one in maps
+    ]
 
 
 def strip(scale: ColourScale) -> Picture:
