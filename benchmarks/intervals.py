@@ -176,7 +176,7 @@ def measure(run: Path, device: str) -> tuple[str, dict[str, Any]]:
     found = {
         **scores(joined, names),
         **times(trained),
-        "steps": json.loads((run / "training.json").read_text(encoding="utf-8"))["step"],
+        "steps": json.loads((run / "training.json").read_text(encoding="utf-8"))["steps"],
     }
     return scene.root.name, found | {"area": areas(trained, scene, names)}
 
