@@ -60,6 +60,7 @@ DEPENDS_ON: dict[str, tuple[str, ...]] = {
     "rig": ("sensors", "light", "model.py"),
     "splats": ("products/splat_fit.py", "products/splats.py", "operators/splatting.py"),
     "spoilt_views": ("captures",),
+    "step_profile": ("operators", "rendering", "engine", "losses", "model.py", "field.py"),
     "store": ("scenes", "datamanager.py"),
     "subspace": ("spectral",),
     "unexplained": ("trained", "spectral/unmixing"),
