@@ -220,12 +220,14 @@ def frame_seconds(trainer: Trainer) -> dict[str, float]:
 
 def start_seconds(words: list[str]) -> dict[str, float]:
     """From a new process to the end of its first step: the second of two starts, when kernels are compiled."""
+    found = {}
     for _ in range(2):
-        began, children = time.perf_counter(), os.times()
+        began, before = time.perf_counter(), os.times()
         subprocess.run([sys.executable, "-c", _FIRST_STEP, *words], check=True, stdout=subprocess.DEVNULL)
-        now = os.times()
-    processor = now.children_user + now.children_system - children.children_user - children.children_system
-    return {"wall s": time.perf_counter() - began, "processor s": processor}
+        after = os.times()
+        spent = after.children_user + after.children_system - before.children_user - before.children_system
+        found = {"wall s": time.perf_counter() - began, "processor s": spent}
+    return found
 
 
 def judge(measured: dict[str, Any]) -> list[_common.Figure]:
