@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from safetensors.torch import load_file, save_file
 
 from tests.factories.ball_model import RADIUS, ball_scene
 from tests.factories.ball_page import box
@@ -152,6 +153,13 @@ def test_a_run_keeps_its_errors_and_says_why_there_are_none(tmp_path):
         read_errors(tmp_path, 10, NUM_BANDS + 1, 3)
     write_errors(tmp_path, None, 10)
     assert not (tmp_path / FILE_NAME).exists()
+
+
+def test_errors_of_an_earlier_layout_are_none_and_that_is_said(tmp_path):
+    write_errors(tmp_path, fitted(count=2000), 10)
+    path = tmp_path / FILE_NAME
+    save_file(load_file(path), path, {"steps": "10"})
+    assert "of an earlier version" in str(read_errors(tmp_path, 10, NUM_BANDS, 3))
 
 
 def test_a_damaged_file_of_errors_is_refused(tmp_path):

@@ -36,7 +36,8 @@ _LEAST_PIXELS = 500
 """With fewer nothing is said."""
 _VIEW_GROUPS = 8
 """Of views, whose endmembers are compared."""
-_STEPS = "steps"
+_STEPS, _FORMAT, _FORMAT_NOW = "steps", "format_version", "2"
+"""What the metadata of the file hold: after how many steps errors were measured, and which layout it has."""
 _MOST_BYTES = 1 << 30
 
 
@@ -131,7 +132,7 @@ def write_errors(run: Path, errors: PlaceErrors | None, steps: int) -> None:
         return
     tensors = {name: values.detach().cpu().contiguous() for name, values in errors.tensors().items()}
     with whole_file(path) as temporary, write_errors_as(path):
-        safetensors.torch.save_file(tensors, temporary, {_STEPS: str(steps)})
+        safetensors.torch.save_file(tensors, temporary, {_STEPS: str(steps), _FORMAT: _FORMAT_NOW})
 
 
 def read_errors(run: Path, steps: int, num_bands: int, num_endmembers: int) -> PlaceErrors | str:
@@ -150,8 +151,9 @@ def read_errors(run: Path, steps: int, num_bands: int, num_endmembers: int) -> P
         if path.stat().st_size > _MOST_BYTES:
             raise ValueError(f"it has more than {_MOST_BYTES:,} bytes")
         with safe_open(path, "pt") as file:
-            measured_at = int((file.metadata() or {}).get(_STEPS, -1))
-            if "absent_factors" not in file.keys():  # noqa: SIM118
+            metadata = file.metadata() or {}
+            measured_at = int(metadata.get(_STEPS, -1))
+            if metadata.get(_FORMAT) != _FORMAT_NOW:
                 return "errors.safetensors is of an earlier version: train the run on, with a larger limit"
             errors = PlaceErrors.of_tensors({name: file.get_tensor(name) for name in file.keys()})  # noqa: SIM118
         shapes = (errors.directions.shape[1], errors.large.sums.shape[1], errors.small.sums.shape[1])
