@@ -27,10 +27,8 @@ DEPENDS = module_of(ROOT / "benchmarks/_depends.py")
 CHECK = module_of(ROOT / "scripts/check_results.py")
 TABLE = module_of(ROOT / "scripts/results_table.py")
 TO_MEASURE_AGAIN = {
-    "confidence": "python benchmarks/confidence.py",
     "found_poses": "python benchmarks/found_poses.py --folder DIR",
     "gpu": "python benchmarks/gpu.py",
-    "neumatex_prior": "python benchmarks/neumatex_prior.py",
 }
 """Results that are not clean, each with the command that measures it again. No other may join them."""
 
