@@ -55,7 +55,7 @@ class _AssetOptions:
     """Width and height of the textures, texels."""
     page_resolution: int = 128
     """Vertices along the longest edge of the object in the page."""
-    splat_steps: int = 600
+    splat_steps: int = 1000
     """Steps in which splats are fitted to the field."""
     output_dir: Path = Path("outputs")
     """Folder for the two runs."""

@@ -221,7 +221,7 @@ class Splats(Product):
     """glb (up is +y), ply (up is -y, as viewers of splats expect)."""
     megabytes: float = 6.0
     """Size of splats.ply, in millions of bytes, at most."""
-    steps: int = 600
+    steps: int = 1000
     """Of the fit; more are slower and nearer to what the run renders. 0: discs on the surface."""
     up: Literal["y", "z"] = "y"
     """z: axes stay those of the scene's world."""

@@ -41,8 +41,9 @@ from unmix_plugin.trained.trained_scene import TrainedScene
 
 _BLUR = 0.3
 """Variance, square pixels of the screen, that viewers add to what they draw."""
-_BLURS = (_BLUR, _BLUR / 4, _BLUR / 16)
-"""Of screens with once, two and four times as many pixels a side as are drawn here."""
+_BLURS = (_BLUR, _BLUR / 16, _BLUR / 4, _BLUR, _BLUR / 16)
+"""Of screens with once, four and two times as many pixels a side as are drawn here, in turns; the extremes, which are
+hardest to fit together, twice."""
 _NEAR = 1e-3
 """Depth, model units, before which nothing is drawn."""
 _MARGIN = 1.3
