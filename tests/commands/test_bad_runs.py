@@ -81,7 +81,7 @@ SPOILT = {
         "Expected `float` > 1e-12 - at `$.pixel_size`",
     ),
     "circle of links": (lambda path: (path / "notes").symlink_to("notes"), "can't open the run folder"),
-    "scene.json cut off": (cut_off("scene.json"), "can't read"),
+    "scene.json cut off": (cut_off("scene.json"), "is not valid JSON"),
     "views outside": (in_scene("summary", frames=[f"../{i}" for i in range(8)]), "the name of a frame"),
     "another grid": (
         in_scene("metadata", grid_resolution=512),

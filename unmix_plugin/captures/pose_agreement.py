@@ -73,9 +73,12 @@ class _Thumbnail:
             width, height = (max(1, round(side * shrunk)) for side in opened.size)
             thumbnail = opened.convert("RGBA").resize((width, height), Image.Resampling.BOX)
         rgba = np.asarray(thumbnail, np.float64) / 255
-        fine = ndimage.uniform_filter(rgba[..., :3] * rgba[..., 3:], (3, 3, 0))
+        fine = rgba[..., :3] * rgba[..., 3:]
+        for axis in (0, 1):
+            fine = ndimage.uniform_filter1d(fine, 3, axis)
         coarse = ndimage.gaussian_filter(fine, (_COARSE_PX, _COARSE_PX, 0))
-        change = np.sqrt(sum(ndimage.sobel(fine, axis) ** 2 for axis in (0, 1)).sum(axis=-1)) / 8
+        slopes = np.stack([ndimage.sobel(fine, axis) for axis in (0, 1)])
+        change = np.linalg.norm(slopes, axis=(0, 3)) / 8
         shown = np.dstack([fine, coarse, ndimage.gaussian_filter(change, _COARSE_PX / 2)])
         change[[0, -1]] = change[:, [0, -1]] = 0.0
         order = np.argsort(change, axis=None)[::-1]
