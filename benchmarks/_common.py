@@ -15,7 +15,8 @@ import sys
 import sysconfig
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Literal, TypeAlias
@@ -302,6 +303,30 @@ def quiet_trainer(words: Sequence[str]) -> Trainer:
 
     with open(os.devnull, "w") as nowhere:  # noqa: PTH123 - a device, not a path
         return Trainer(parse(list(words))[0], console=Console(file=nowhere, quiet=True))
+
+
+def take_steps(trainer: Trainer, numbers: Iterable[int], total: int) -> int:
+    """Take these of `total` steps as a training does, parameters averaged; their rays. Step 0 starts a training."""
+    rays = 0
+    for step in numbers:
+        if step == 0:
+            trainer.pipeline.model.warm_up()
+            trainer.steps.begin(0)
+        rays += trainer.steps.take(step, step / total).num_rays
+        if trainer.average is not None:
+            trainer.average.update(step + 1)
+    return rays
+
+
+def averaged(trainer: Trainer) -> AbstractContextManager[None]:
+    """The trainer's model with its parameters averaged over steps, where the method averages them."""
+    return nullcontext() if trainer.average is None else trainer.average.swapped_in()
+
+
+def evaluated_psnr(trainer: Trainer) -> float:
+    """Mean PSNR of the evaluation views, dB."""
+    with averaged(trainer):
+        return trainer.pipeline.get_average_eval_image_metrics_and_images()[0]["psnr"]
 
 
 def json_lines(path: Path) -> list[dict[str, Any]]:

@@ -10,7 +10,6 @@ about as many seconds of wall time, with two fewer. Takes about five minutes, on
 from __future__ import annotations
 
 import time
-from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean
@@ -63,7 +62,7 @@ def main(options: Options) -> None:
         words += ["--device", "cpu", "--max-num-iterations", str(steps)]
         trainer = _common.quiet_trainer(words)
         measured = trained(trainer, steps)
-        with nullcontext() if trainer.average is None else trainer.average.swapped_in():
+        with _common.averaged(trainer):
             measured |= rendered(trainer, options.eval_views)
     setting = {
         "scene": f"built-in, {views} views x {size} x {size} pixels x 31 bands",
@@ -83,13 +82,8 @@ def main(options: Options) -> None:
 
 def trained(trainer: Trainer, steps: int) -> dict[str, Any]:
     """Seconds of the training."""
-    trainer.pipeline.model.warm_up()
-    trainer.steps.begin(0)
-    began, rays = (time.process_time(), time.perf_counter()), 0
-    for step in range(steps):
-        rays += trainer.steps.take(step, step / steps).num_rays
-        if trainer.average is not None:
-            trainer.average.update(step + 1)
+    began = time.process_time(), time.perf_counter()
+    rays = _common.take_steps(trainer, range(steps), steps)
     return {
         "training_cpu_seconds": time.process_time() - began[0],
         "training_wall_seconds": time.perf_counter() - began[1],

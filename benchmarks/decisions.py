@@ -15,7 +15,7 @@ import json
 import tempfile
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -376,26 +376,11 @@ def judge_case(case: Case, scene: Path) -> Iterator[dict[str, Any]]:
 
 def psnr_of(scene: Path, world: str, steps: int, runs: Path) -> float:
     """Of the evaluation views, after so many steps."""
-    words = [
-        "unmix-nerf",
-        "--data",
-        str(scene),
-        "--device",
-        "cpu",
-        "--world",
-        world,
-        "--output-dir",
-        str(runs),
-    ]
-    trainer = _common.quiet_trainer([*words, "--max-num-iterations", str(steps)])
-    trainer.pipeline.model.warm_up()
-    trainer.steps.begin(0)
-    for step in range(steps):
-        trainer.steps.take(step, step / steps)
-        if trainer.average is not None:
-            trainer.average.update(step + 1)
-    with nullcontext() if trainer.average is None else trainer.average.swapped_in():
-        return trainer.pipeline.get_average_eval_image_metrics_and_images()[0]["psnr"]
+    words = ["unmix-nerf", "--data", str(scene), "--device", "cpu", "--world", world]
+    words += ["--output-dir", str(runs), "--max-num-iterations", str(steps)]
+    trainer = _common.quiet_trainer(words)
+    _common.take_steps(trainer, range(steps), steps)
+    return _common.evaluated_psnr(trainer)
 
 
 def main(options: Options) -> None:

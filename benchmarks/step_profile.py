@@ -5,7 +5,7 @@
 Trains for a while on an object, a closed room, large pictures and many bands, with all defaults, and times the parts of
 the steps that follow, in wall and in processor seconds. Then a few steps are recorded operation by operation: how many
 tensor operations a step has, which take longest, how much memory they ask for, and how long the main thread is in none,
-which is Python's part. A frame of 512 rows is timed (slower than a trained one), and the first step after the command.
+which is Python's part. A frame of 512 rows is timed, and the first step after the command.
 Exports, pages and captures have benchmarks of their own (export_speed, page, processing). About six minutes on two
 quiet cores.
 """
@@ -20,7 +20,6 @@ import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Callable
-from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,7 +30,6 @@ import torch
 import tyro
 from torch.profiler import ProfilerActivity, profile
 
-from unmix_plugin.engine.training.steps import TrainingSteps
 from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.scenes.demo.scene import make_demo_scene
 
@@ -125,13 +123,10 @@ class Clock:
 
 def profiled(trainer: Trainer, before: int, count: int) -> dict[str, Any]:
     """Seconds a step by part, and the operations of a step."""
-    steps, total = trainer.steps, 3000
-    trainer.pipeline.model.warm_up()
-    steps.begin(0)
-    for step in range(before):
-        steps.take(step, step / total)
+    total = 3000
+    _common.take_steps(trainer, range(before), total)
     clock = Clock()
-    rays = timed_steps(steps, clock, range(before, before + count), total)
+    rays = timed_steps(trainer, clock, range(before, before + count), total)
     wall, processor = clock.spent.pop("step")
     parts = {part: [1000 * value / count for value in spent] for part, spent in clock.spent.items()}
     parts["the rest"] = [
@@ -147,13 +142,13 @@ def profiled(trainer: Trainer, before: int, count: int) -> dict[str, Any]:
             "rays per processor second": rays / processor,
         },
         "parts": parts,
-        **recorded(steps, before + count, total),
+        **recorded(trainer, range(before + count, before + count + _RECORDED), total),
     }
 
 
-def timed_steps(steps: TrainingSteps, clock: Clock, numbers: range, total: int) -> int:
+def timed_steps(trainer: Trainer, clock: Clock, numbers: range, total: int) -> int:
     """Take steps with their parts timed; rays of all."""
-    pipeline, model = steps.pipeline, steps.pipeline.model
+    steps, pipeline, model = trainer.steps, trainer.pipeline, trainer.pipeline.model
     plain = [
         (pipeline.datamanager, "next_train", "batch"),
         (model, "between_steps", "grid and guide, between steps"),
@@ -162,24 +157,23 @@ def timed_steps(steps: TrainingSteps, clock: Clock, numbers: range, total: int) 
         (model, "update", "what is learnt from a step without gradients"),
         (torch.Tensor, "backward", "backward"),
         (steps.optimizer, "step", "optimiser"),
+        *([] if trainer.average is None else [(trainer.average, "update", "averages of parameters")]),
     ]
     kept = [(owner, name, getattr(owner, name)) for owner, name, _ in plain]
     for owner, name, part in plain:
         setattr(owner, name, clock.timed(part, getattr(owner, name)))
-    take = clock.timed("step", steps.take)
     try:
-        return sum(take(step, step / total).num_rays for step in numbers)
+        return clock.timed("step", _common.take_steps)(trainer, numbers, total)
     finally:
         for owner, name, call in kept:
             setattr(owner, name, call)
 
 
-def recorded(steps: TrainingSteps, first: int, total: int) -> dict[str, Any]:
+def recorded(trainer: Trainer, numbers: range, total: int) -> dict[str, Any]:
     """Operations of a step by the profiler of PyTorch, which itself takes time."""
     with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as record:
         began = time.perf_counter()
-        for step in range(first, first + _RECORDED):
-            steps.take(step, step / total)
+        _common.take_steps(trainer, numbers, total)
         wall = time.perf_counter() - began
     events = record.events()
     assert events is not None
@@ -207,7 +201,7 @@ def frame_seconds(trainer: Trainer) -> dict[str, float]:
     width = round(_FRAME_ROWS * camera.width / camera.height)
     model.eval()
     found = []
-    with nullcontext() if trainer.average is None else trainer.average.swapped_in():
+    with _common.averaged(trainer):
         for _ in range(3):
             began = time.perf_counter(), time.process_time()
             model.get_outputs_for_camera(camera.resized(width, _FRAME_ROWS))

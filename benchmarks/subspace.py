@@ -10,7 +10,6 @@ The steps of both are taken in turn, so that a busy machine slows both. Takes ab
 from __future__ import annotations
 
 import time
-from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
@@ -67,7 +66,7 @@ def main(options: Options) -> None:
         seconds = train_in_turn(list(trainers.values()), steps)
         measured = {
             name: {
-                "psnr": evaluated(trainer),
+                "psnr": _common.evaluated_psnr(trainer),
                 "step_cpu_ms": 1e3 * median(taken),
                 "pixel_mb": held_bytes(trainer) / 1e6,
             }
@@ -108,24 +107,12 @@ def held_bytes(trainer: Trainer) -> int:
 def train_in_turn(trainers: list[Trainer], steps: int) -> list[list[float]]:
     """Train all, a step of each after the other; processor seconds of the steps of each."""
     seconds: list[list[float]] = [[] for _ in trainers]
-    for trainer in trainers:
-        trainer.pipeline.model.warm_up()
-        trainer.steps.begin(0)
     for step in range(steps):
         for trainer, taken in zip(trainers, seconds, strict=True):
             began = time.process_time()
-            trainer.steps.take(step, step / steps)
-            if trainer.average is not None:
-                trainer.average.update(step + 1)
+            _common.take_steps(trainer, [step], steps)
             taken.append(time.process_time() - began)
     return [taken[UNTIMED_STEPS:] for taken in seconds]
-
-
-def evaluated(trainer: Trainer) -> float:
-    """PSNR of the evaluation views in dB."""
-    with nullcontext() if trainer.average is None else trainer.average.swapped_in():
-        metrics, _ = trainer.pipeline.get_average_eval_image_metrics_and_images()
-    return metrics["psnr"]
 
 
 def judge(measured: dict[str, dict[str, Any]]) -> list[_common.Figure]:
