@@ -25,6 +25,7 @@ import torch
 import tyro
 
 from unmix_plugin.engine.model import TrainingCallbackLocation
+from unmix_plugin.engine.training.batches import work_on_batches
 from unmix_plugin.engine.training.steps import run_callbacks
 from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.model import UnmixModel
@@ -155,15 +156,15 @@ def timed_step(trainer: Trainer, step: int) -> StepCost:
     trainer.pipeline.seed_step(step)
     synchronise(trainer)
     wall, cpu = time.perf_counter(), time.process_time()
-    outputs, losses, _ = trainer.pipeline.get_train_loss_dict(step)
     trainer.optimizer.zero_grad()
-    torch.stack(list(losses.values())).sum().backward()
+    batches = work_on_batches(trainer.pipeline, step)
     trainer.optimizer.step()
     run_callbacks(trainer.callbacks, TrainingCallbackLocation.AFTER_TRAIN_ITERATION, step, 1.0)
     synchronise(trainer)
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     num_rays = trainer.pipeline.datamanager.get_train_rays_per_batch()
-    return StepCost(wall, cpu, num_rays, trainer.pipeline.model.num_samples(outputs))
+    model = trainer.pipeline.model
+    return StepCost(wall, cpu, num_rays, sum(model.num_samples(batch.outputs) for batch in batches))
 
 
 def synchronise(trainer: Trainer) -> None:

@@ -3,9 +3,9 @@
     python benchmarks/step_profile.py [--only object room] [--steps 60]
 
 Trains for a while on an object, a closed room, large pictures and many bands, with all defaults, and times the parts of
-the steps that follow, in wall and in processor seconds. Then a few steps are recorded operation by operation: how many
-tensor operations a step has, which take longest, how much memory they ask for, and how long the main thread is in none,
-which is Python's part. A frame of 512 rows is timed, and the first step after the command.
+the steps that follow, in processor seconds of the threads that call them. Then a few steps are recorded operation by
+operation: how many tensor operations a step has, which take longest, how much memory they ask for, and how long the
+main thread is in none, which is Python's part. A frame of 512 rows is timed, and the first step after the command.
 Exports, pages and captures have benchmarks of their own (export_speed, page, processing). About six minutes on two
 quiet cores.
 """
@@ -22,6 +22,7 @@ from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import _common
@@ -102,21 +103,22 @@ def main(options: Options) -> None:
 
 
 class Clock:
-    """Adds up what calls take, in wall and in processor seconds of all threads."""
+    """Adds up what calls take of the processor, in seconds of the threads that call."""
 
     def __init__(self) -> None:
-        self.spent: dict[str, list[float]] = defaultdict(lambda: [0.0, 0.0])
+        self.spent: dict[str, float] = defaultdict(float)
+        self._adding = Lock()
 
     def timed(self, part: str, call: Callable[..., Any]) -> Callable[..., Any]:
         """The same call, timed."""
 
         def run(*args: Any, **kwargs: Any) -> Any:
-            began = time.perf_counter(), time.process_time()
+            began = time.thread_time()
             try:
                 return call(*args, **kwargs)
             finally:
-                self.spent[part][0] += time.perf_counter() - began[0]
-                self.spent[part][1] += time.process_time() - began[1]
+                with self._adding:
+                    self.spent[part] += time.thread_time() - began
 
         return run
 
@@ -125,14 +127,11 @@ def profiled(trainer: Trainer, before: int, count: int) -> dict[str, Any]:
     """Seconds a step by part, and the operations of a step."""
     total = 3000
     _common.take_steps(trainer, range(before), total)
-    clock = Clock()
+    clock, began = Clock(), (time.perf_counter(), time.process_time())
     rays = timed_steps(trainer, clock, range(before, before + count), total)
-    wall, processor = clock.spent.pop("step")
-    parts = {part: [1000 * value / count for value in spent] for part, spent in clock.spent.items()}
-    parts["the rest"] = [
-        1000 * whole / count - sum(spent[index] for spent in parts.values())
-        for index, whole in enumerate((wall, processor))
-    ]
+    wall, processor = time.perf_counter() - began[0], time.process_time() - began[1]
+    parts = {part: 1000 * spent / count for part, spent in clock.spent.items()}
+    parts["the rest, and other threads"] = 1000 * processor / count - sum(parts.values())
     return {
         "step": {
             "wall ms": 1000 * wall / count,
@@ -147,14 +146,14 @@ def profiled(trainer: Trainer, before: int, count: int) -> dict[str, Any]:
 
 
 def timed_steps(trainer: Trainer, clock: Clock, numbers: range, total: int) -> int:
-    """Take steps with their parts timed; rays of all."""
+    """Take steps with their parts timed, in whichever thread they run; rays of all."""
     steps, pipeline, model = trainer.steps, trainer.pipeline, trainer.pipeline.model
     plain = [
-        (pipeline.datamanager, "next_train", "batch"),
-        (model, "between_steps", "grid and guide, between steps"),
-        (model, "training_batch", "rays rendered and compared"),
-        (model, "losses", "losses"),
-        (model, "update", "what is learnt from a step without gradients"),
+        (type(pipeline.datamanager), "next_train", "batch"),
+        (type(model), "between_steps", "grid and guide, between steps"),
+        (type(model), "training_batch", "rays rendered and compared"),
+        (type(model), "losses", "losses"),
+        (type(model), "update", "what is learnt from a step without gradients"),
         (torch.Tensor, "backward", "backward"),
         (steps.optimizer, "step", "optimiser"),
         *([] if trainer.average is None else [(trainer.average, "update", "averages of parameters")]),
@@ -163,7 +162,7 @@ def timed_steps(trainer: Trainer, clock: Clock, numbers: range, total: int) -> i
     for owner, name, part in plain:
         setattr(owner, name, clock.timed(part, getattr(owner, name)))
     try:
-        return clock.timed("step", _common.take_steps)(trainer, numbers, total)
+        return _common.take_steps(trainer, numbers, total)
     finally:
         for owner, name, call in kept:
             setattr(owner, name, call)
@@ -251,9 +250,9 @@ def tables(measured: dict[str, Any]) -> tuple[_common.DetailTable, ...]:
         for name, one in measured.items()
     ]  # fmt: skip
     parts = [
-        [name, part, f"{wall:.2f}", f"{processor:.2f}"]
+        [name, part, f"{processor:.2f}"]
         for name, one in measured.items()
-        for part, (wall, processor) in one["parts"].items()
+        for part, processor in one["parts"].items()
     ]
     longest = [
         [name, operation, f"{count:.0f}", f"{ms:.2f}"]
@@ -265,7 +264,7 @@ def tables(measured: dict[str, Any]) -> tuple[_common.DetailTable, ...]:
         _common.DetailTable(
             "a step", ["scene", *first, "operations with those within", "MB asked for"], steps
         ),
-        _common.DetailTable("parts of a step, ms", ["scene", "part", "wall", "processor"], parts),
+        _common.DetailTable("parts of a step, processor ms", ["scene", "part", "ms"], parts),
         _common.DetailTable("longest operations", ["scene", "operation", "a step", "own ms a step"], longest),
     )
 

@@ -37,11 +37,14 @@ def train(config: TrainerConfig, data: Path, num_steps: int) -> dict[str, float]
         loss = torch.stack(list(losses.values())).sum()
         adam.zero_grad()
         loss.backward()
+        with torch.no_grad():
+            model.update(outputs)  # what is learnt without gradients
         adam.step()
         for callback in callbacks:
             if callback.where is TrainingCallbackLocation.AFTER_TRAIN_ITERATION:
                 callback.func(step, progress)
-        rays.set_train_rays_per_batch(model.next_num_rays(outputs, len(bundle)) or len(bundle))
+        wanted = model.next_num_rays(model.num_samples(outputs), len(bundle))
+        rays.set_train_rays_per_batch(wanted or len(bundle))
         if step % 100 == 0:
             print(f"step {step}: loss {loss.item():.4f}")
     return pipeline.get_average_eval_image_metrics_and_images()[0]

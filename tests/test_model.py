@@ -84,10 +84,9 @@ def test_spectra_stay_physical_after_an_update():
 
 def test_rays_adapt_to_the_budget_of_samples():
     model = make_model(samples_per_step=1000)
-    rays, outputs = 400, {"num_samples": torch.tensor(0)}
+    rays = 400
     for _ in range(30):
-        outputs["num_samples"] = torch.tensor(5 * rays)
-        rays = model.next_num_rays(outputs, rays) or 0
+        rays = model.next_num_rays(5 * rays, rays) or 0
     assert rays == pytest.approx(200, abs=2)
 
 
@@ -117,7 +116,7 @@ def occupied_after_training(has_alpha: bool = True, visible_weight: float | str 
         step = model.training_batch(bundle, from_batch(batch, 2000, model.seen_by.num_channels))
         model.losses(step)
         assert int(model.grid.visibility.num_rays) == 0
-        model.update(step)
+        model.update({"batch": step})
         model.get_training_callbacks()[0].func(0, 0.0)
     return model.grid.occupied.float().mean(dim=(0, 1)).flip(0)
 

@@ -84,6 +84,7 @@ class TrainingBatch:
 class UnmixModel(Model):
     """A mixture of materials at every point of a scene box."""
 
+    batches_at_once = 2
     config: UnmixModelConfig
     rgb_weights: Tensor
     every_band: Tensor
@@ -277,9 +278,9 @@ class UnmixModel(Model):
         }
 
     def get_train_loss_dict(self, ray_bundle: RayBundle, batch: dict[str, Tensor]) -> TrainOutputs:
-        """`num_samples`; weighted losses by name, those of no weight left out; and `psnr` of the batch in dB, on black,
-        samples a ray evaluated and visible, the share of the grid's cells that are occupied, how far poses were
-        corrected, and in an unbounded world the part of light that does not come from the sky."""
+        """`batch` and `num_samples`; weighted losses by name, those of no weight left out; and `psnr` of the batch in
+        dB, on black, samples a ray evaluated and visible, the share of the grid's cells that are occupied, how far
+        poses were corrected, and in an unbounded world the part of light that does not come from the sky."""
         num_rays = max(len(ray_bundle), 1)
         measured = from_batch(batch, len(ray_bundle), self.seen_by.num_channels)
         step = self.training_batch(ray_bundle, measured)
@@ -294,9 +295,7 @@ class UnmixModel(Model):
             metrics |= self.poses.figures(step.corrected.steps)
         if self.is_unbounded:
             metrics["matter_share"] = rendered.coefficients.accumulation.detach().mean()
-        with torch.no_grad():
-            self.update(step)
-        return {"num_samples": torch.tensor(rendered.num_samples)}, losses, metrics
+        return {"batch": step, "num_samples": rendered.num_samples}, losses, metrics
 
     def training_batch(self, ray_bundle: RayBundle, measured: list[MeasuredPixels]) -> TrainingBatch:
         """Rays of training views, rendered and laid beside what was measured along them; changes nothing."""
@@ -332,8 +331,9 @@ class UnmixModel(Model):
             weighed["poses"] = self.poses.penalty(step.corrected.steps)
         return weighed
 
-    def update(self, step: TrainingBatch) -> None:
+    def update(self, outputs: dict[str, Any]) -> None:
         """Note which cells the views see, and how far margins of abundances are from those of measured spectra."""
+        step: TrainingBatch = outputs["batch"]
         rendered, views = step.rendered, step.corrected.rays.camera_indices
         visible_weight = float(self.config.renderer.visible_weight)
         if visible_weight < 1:
@@ -392,17 +392,17 @@ class UnmixModel(Model):
         before, after = TrainingCallbackLocation
         return [TrainingCallback(before, self._begin_step), TrainingCallback(after, self._bound_spectra)]
 
-    def num_samples(self, outputs: dict[str, Tensor]) -> int:
+    def num_samples(self, outputs: dict[str, Any]) -> int:
         """Samples that light may reach, of the batch with these outputs."""
-        return int(outputs["num_samples"])
+        return outputs["num_samples"]
 
-    def next_num_rays(self, outputs: dict[str, Tensor], current: int) -> int | None:
+    def next_num_rays(self, num_samples: int, current: int) -> int | None:
         """Half of the way to the rays with which a step would have `samples_per_step`."""
         samples = self.config.samples_per_step
         if samples == "auto":  # of a run from before it was settled
             samples = SAMPLES_ON_CPU if self.device.type == "cpu" else SAMPLES_ON_GPU
         samples = samples / self.processes.count
-        samples_a_ray = max(self.num_samples(outputs) / current, _FEWEST_SAMPLES_A_RAY)
+        samples_a_ray = max(num_samples / current, _FEWEST_SAMPLES_A_RAY)
         return max(int(current + samples / samples_a_ray) // 2, _FEWEST_RAYS)
 
     def warm_up(self) -> None:

@@ -54,7 +54,7 @@ def test_what_a_step_draws_follows_from_the_seed_and_the_step_alone(pipeline):
     def loss(step):
         pipeline.seed_step(step)
         torch.rand(3)  # somebody else draws from the global generator
-        return pipeline.get_train_loss_dict(5)[1]["rgb_loss"].item()
+        return next(pipeline.train_batches(5))()[1]["rgb_loss"].item()
 
     assert loss(5) == loss(5) != loss(6)
 

@@ -154,7 +154,7 @@ class RgbNerf(Model):
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
         return {"psnr": float(self.get_metrics_dict(outputs, batch)["psnr"])}, {"rgb": outputs["rgb"]}
 
-    def next_num_rays(self, outputs: dict[str, Tensor], current: int) -> int | None:
+    def next_num_rays(self, num_samples: int, current: int) -> int | None:
         return min(current + 1, 600)
 
 

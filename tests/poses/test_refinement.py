@@ -179,7 +179,7 @@ def test_what_rays_meet_counts_as_probed_since_nothing_is_carved():
     rays = make_rays(200)
     rays = replace(rays, axes=rays.directions, pixel_coords=torch.zeros(200, 2))
     batch = {"spectra": torch.rand(200, 5), "alpha": torch.ones(200), "pixels": torch.arange(200)}
-    model.get_train_loss_dict(rays, batch)
+    model.update(model.get_train_loss_dict(rays, batch)[0])
     nothing = torch.Generator().manual_seed(0)
     model.grid.update(lambda points: torch.zeros(len(points)), 0.1, 0.5, 0, nothing)
     assert 0.1 < model.grid.peak_densities.isfinite().float().mean() < 1

@@ -109,7 +109,7 @@ def test_training_tells_the_grid_what_rays_meet_unless_alpha_carves_it():
     batch = {"spectra": torch.rand(200, 5), "alpha": torch.ones(200), "pixels": torch.arange(200)}
     for model in (carved, boxed, world):
         model.generator = torch.Generator().manual_seed(0)
-        model.get_train_loss_dict(rays, batch)
+        model.update(model.get_train_loss_dict(rays, batch)[0])
     assert carved.grid.observed is None
     assert boxed.grid.observed is not None
     assert bool((boxed.grid.observed >= 0).any())

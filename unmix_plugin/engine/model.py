@@ -125,9 +125,9 @@ class DataManager(ABC):
         return []
 
 
-TrainOutputs: TypeAlias = tuple[dict[str, Tensor], dict[str, Any], dict[str, Tensor]]
-"""Outputs, losses and metrics of one batch. Losses may be a plugin's own: the training step checks that they are
-tensors, and names the plugin if they are not."""
+TrainOutputs: TypeAlias = tuple[dict[str, Any], dict[str, Any], dict[str, Tensor]]
+"""Outputs, losses and metrics of one batch. Outputs are what the model itself makes use of; losses may be a plugin's
+own: the training step checks that they are tensors, and names the plugin if they are not."""
 
 
 class Model(nn.Module, ABC):
@@ -137,6 +137,11 @@ class Model(nn.Module, ABC):
     buffer; the checkpoint gives the values. So a run folder renders without the data it was trained on.
     """
 
+    batches_at_once: int = 1
+    """How many batches of a step a CPU with several threads may work on at once, 1 or 2. Of 2, each is the work of half
+    of the threads on a shallow copy of the model with half of the rays and a `generator` of its own; so
+    `get_train_loss_dict` must change nothing that the copies share, and leave what it learns without gradients to
+    `update`."""
     outputs: tuple[Output, ...] = ()
     """What `get_outputs_for_camera` gives that can be shown. `accumulation` (opacity) and `ray_distance` (model units)
     have the meaning that they have everywhere."""
@@ -232,11 +237,15 @@ class Model(nn.Module, ABC):
     def get_train_loss_dict(self, ray_bundle: RayBundle, batch: dict[str, Tensor]) -> TrainOutputs:
         """Outputs, losses and metrics of a training batch; a model that shares work between them writes this anew.
 
-        The outputs go to `num_samples` and `next_num_rays` alone.
+        The outputs go to `num_samples` and `update` alone.
         """
         outputs = self(ray_bundle)
         metrics = self.get_metrics_dict(outputs, batch)
         return outputs, self.get_loss_dict(outputs, batch, metrics), metrics
+
+    def update(self, outputs: dict[str, Any]) -> None:
+        """Learn from the outputs of a batch what has no gradient. Called without gradients for each batch of a step in
+        turn, once all gradients are known and before the optimiser's update."""
 
     @abstractmethod
     def get_image_metrics_and_images(
@@ -258,12 +267,12 @@ class Model(nn.Module, ABC):
         """Functions to call around each step."""
         return []
 
-    def num_samples(self, outputs: dict[str, Tensor]) -> int:
+    def num_samples(self, outputs: dict[str, Any]) -> int:
         """Field samples behind `outputs`, for the log; 0 where a model does not count."""
         return 0
 
-    def next_num_rays(self, outputs: dict[str, Tensor], current: int) -> int | None:
-        """Rays that the next step should have, given the outputs of one with `current` rays; None leaves it."""
+    def next_num_rays(self, num_samples: int, current: int) -> int | None:
+        """Rays that the next step should have, given the samples of one with `current` rays; None leaves it."""
         return None
 
     def warm_up(self) -> None:

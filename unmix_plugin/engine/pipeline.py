@@ -1,9 +1,11 @@
 """A data manager and a model, joined: what one training or evaluation step computes."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from copy import copy
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -18,6 +20,8 @@ _MODEL_STREAM = 1
 """Stream of randomness of the model's own draws in a step; data managers draw from stream 0."""
 _PROCESS_STREAM = 2
 """From which the other processes of a training take their seeds."""
+_BATCH_STREAM = 3
+"""From which the other batches of a step take their seeds."""
 
 
 class Pipeline(nn.Module):
@@ -74,9 +78,19 @@ class Pipeline(nn.Module):
         # For what takes no generator, such as dropout or NumPy.
         seed_everything(step_seed(self.seed, step, _MODEL_STREAM))
 
-    def get_train_loss_dict(self, step: int) -> TrainOutputs:
-        """Outputs, losses and metrics of training step `step`."""
-        return self.model.get_train_loss_dict(*self.datamanager.next_train(step))
+    def train_batches(self, step: int, count: int = 1) -> Iterator[Callable[[], TrainOutputs]]:
+        """The batches of training step `step`, each with its part of the rays, drawn when asked for; calls give
+        their outputs, losses and metrics. What several batches draw is not what a single one would."""
+        if count == 1:
+            yield partial(self.model.get_train_loss_dict, *self.datamanager.next_train(step))
+            return
+        num_rays = self.datamanager.get_train_rays_per_batch() // count
+        for batch in range(count):
+            data, model = copy(self.datamanager), copy(self.model)
+            data.seed = step_seed(self.seed, batch, _BATCH_STREAM)
+            data.set_train_rays_per_batch(num_rays)
+            model.generator = step_generator(data.seed, step, data.device, _MODEL_STREAM)
+            yield partial(model.get_train_loss_dict, *data.next_train(step))
 
     @torch.no_grad()
     def evaluate_images(self) -> Iterator[tuple[str, dict[str, float], dict[str, Tensor]]]:

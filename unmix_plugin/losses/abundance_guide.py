@@ -12,6 +12,7 @@ Notation: `N` and `R` pixels, `K` endmembers, `B` bands of the scene, `b` channe
 from __future__ import annotations
 
 from collections.abc import Mapping
+from threading import Lock
 
 import numpy as np
 import torch
@@ -43,6 +44,8 @@ _CLEAR_MARGIN = 0.9
 """Nearly pure pixels, whose margin is larger, hardly err, and would hide what the others do."""
 _DECAY = 0.99
 _CACHE_BYTES = 1 << 26
+_CACHE = Lock()
+"""Batches that are worked on at once share what is kept of pixels."""
 _SHARED_ERROR = 2.0
 """Variance of a margin's error in multiples of that of field against pixels: errors of both cancel in it."""
 
@@ -103,20 +106,22 @@ class AbundanceGuide(nn.Module):
         fixed number of slots, whatever the size of the scene. Values are kept, and given even the first time, in half
         precision, so that a resumed training sees the same ones.
         """
-        if len(self._keys) == 0:
-            num_endmembers, device = len(self.endmembers), self.endmembers.device
-            num_slots = min(1 << 20, _CACHE_BYTES // (2 * num_endmembers))
-            self._keys = torch.full((num_slots,), -1, dtype=torch.int64, device=device)
-            self._mixtures = torch.zeros(num_slots, num_endmembers, dtype=torch.float16, device=device)
-        slots = pixels % len(self._keys)
-        is_new = (self._keys[slots] != pixels).nonzero()[:, 0]
-        values = self._mixtures[slots]
+        with _CACHE:
+            if len(self._keys) == 0:
+                num_endmembers, device = len(self.endmembers), self.endmembers.device
+                num_slots = min(1 << 20, _CACHE_BYTES // (2 * num_endmembers))
+                self._keys = torch.full((num_slots,), -1, dtype=torch.int64, device=device)
+                self._mixtures = torch.zeros(num_slots, num_endmembers, dtype=torch.float16, device=device)
+            slots = pixels % len(self._keys)
+            is_new = (self._keys[slots] != pixels).nonzero()[:, 0]
+            values = self._mixtures[slots]
         if len(is_new):
             values[is_new] = sparse_abundances(spectra[is_new], endmembers, self.penalty).to(values)
-            self._keys[slots[is_new]] = pixels[is_new]
-            # Two pixels of a batch may share a slot; only one of them has it in the end.
-            kept = is_new[self._keys[slots[is_new]] == pixels[is_new]]
-            self._mixtures[slots[kept]] = values[kept]
+            with _CACHE:
+                self._keys[slots[is_new]] = pixels[is_new]
+                # Two pixels of a batch may share a slot; only one of them has it in the end.
+                kept = is_new[self._keys[slots[is_new]] == pixels[is_new]]
+                self._mixtures[slots[kept]] = values[kept]
         return values.to(spectra)
 
 

@@ -17,7 +17,8 @@ from torch import nn
 from tests.factories.trainings import quiet_trainer
 from unmix_plugin.commands.training import finish
 from unmix_plugin.engine.configs import OptimizerConfig, TrainerConfig
-from unmix_plugin.engine.model import TrainingCallback, TrainingCallbackLocation
+from unmix_plugin.engine.geometry.space import RayBundle
+from unmix_plugin.engine.model import TrainingCallback, TrainingCallbackLocation, TrainOutputs
 from unmix_plugin.engine.runs.checkpoints import newest_complete_checkpoint
 from unmix_plugin.engine.runs.load_run import load_model
 from unmix_plugin.engine.training import optimizers as guards
@@ -163,13 +164,14 @@ def test_only_refusals_in_a_row_end_training(monkeypatch):
 def poisoned_trainer(config: TrainerConfig, steps: set[int]) -> Trainer:
     """Its loss is NaN in `steps`."""
     trainer = quiet_trainer(config)
-    original = trainer.pipeline.get_train_loss_dict
+    original = trainer.pipeline.model.get_train_loss_dict
 
-    def poisoned(step: int):
-        outputs, losses, metrics = original(step)
-        return outputs, {"rgb_loss": losses["rgb_loss"] * (math.nan if step in steps else 1.0)}, metrics
+    def poisoned(ray_bundle: RayBundle, batch: dict[str, torch.Tensor]) -> TrainOutputs:
+        outputs, losses, metrics = original(ray_bundle, batch)
+        factor = math.nan if trainer.step in steps else 1.0
+        return outputs, {"rgb_loss": losses["rgb_loss"] * factor}, metrics
 
-    trainer.pipeline.get_train_loss_dict = poisoned  # type: ignore[method-assign]
+    trainer.pipeline.model.get_train_loss_dict = poisoned  # type: ignore[method-assign]
     return trainer
 
 

@@ -149,11 +149,11 @@ def test_a_fit_begins_at_the_prior_which_stays_as_it_is(tmp_path, material, fit_
     assert bool(pipeline.model.get_param_groups()["networks"]) is fit_networks
     pipeline.train()
     pipeline.seed_step(0)
-    _, losses, _ = pipeline.get_train_loss_dict(0)
+    _, losses, _ = next(pipeline.train_batches(0))()
     assert float(losses["prior"].detach()) == 0
     with torch.no_grad():
         pipeline.model.triplane.planes += 0.1
-    _, losses, _ = pipeline.get_train_loss_dict(0)
+    _, losses, _ = next(pipeline.train_batches(0))()
     assert float(losses["prior"].detach()) > 0
     torch.stack(list(losses.values())).sum().backward()
     moved = {name for name, parameter in pipeline.model.named_parameters() if parameter.grad is not None}

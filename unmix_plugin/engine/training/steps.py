@@ -8,12 +8,11 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from unmix_plugin.engine.configs import OptimizerConfig, TrainerConfig, place_of
+from unmix_plugin.engine.configs import OptimizerConfig, TrainerConfig
 from unmix_plugin.engine.machine import resolve_device, seed_everything
 from unmix_plugin.engine.model import TrainingCallback, TrainingCallbackLocation
 from unmix_plugin.engine.pipeline import Pipeline
@@ -28,6 +27,7 @@ from unmix_plugin.engine.runs.checkpoints import (
 from unmix_plugin.engine.runs.config_json import config_to_json
 from unmix_plugin.engine.runs.load_run import require_data
 from unmix_plugin.engine.runs.run_folder import open_run_folder
+from unmix_plugin.engine.training.batches import mean_values, work_on_batches
 from unmix_plugin.engine.training.optimizers import (
     GradientGuard,
     build_optimizer,
@@ -151,12 +151,14 @@ class TrainingSteps:
             forget_gradients(self.optimizer, reset)
         num_rays = datamanager.get_train_rays_per_batch()
         self.learning_rates = set_learning_rates(self.optimizer, self.configs, progress)
-        outputs, losses, metrics = pipeline.get_train_loss_dict(step)
-        _require_losses(losses, type(pipeline.model))
-        total = torch.stack([loss.reshape(()) for loss in losses.values()]).sum()
         self.optimizer.zero_grad()
-        total.backward()
-        wanted = pipeline.model.next_num_rays(outputs, num_rays)
+        batches = work_on_batches(pipeline, step)
+        total = torch.stack([batch.loss for batch in batches]).sum()
+        with torch.no_grad():
+            for batch in batches:
+                pipeline.model.update(batch.outputs)
+        num_samples = sum(pipeline.model.num_samples(batch.outputs) for batch in batches)
+        wanted = pipeline.model.next_num_rays(num_samples, num_rays)
         if self.processes.count > 1:
             total, wanted = self._averaged(total, wanted)
         is_finite, loss = self.guard.check(total)
@@ -165,9 +167,9 @@ class TrainingSteps:
         run_callbacks(self.callbacks, TrainingCallbackLocation.AFTER_TRAIN_ITERATION, step, progress)
         if wanted is not None:
             datamanager.set_train_rays_per_batch(wanted)
-        counts = {"num_rays": num_rays, "num_samples": pipeline.model.num_samples(outputs)}
-        values = {name: value.detach() for name, value in {**losses, **metrics}.items()}
-        values.update({name: torch.tensor(float(count)) for name, count in counts.items()})
+        values = mean_values(batches)
+        for name, count in {"num_rays": num_rays, "num_samples": num_samples}.items():
+            values[name] = torch.tensor(float(count))
         return StepResult(loss, values, num_rays * self.processes.count, not is_finite, bool(reset))
 
     def _averaged(self, total: Tensor, wanted: int | None) -> tuple[Tensor, int | None]:
@@ -185,27 +187,6 @@ def run_callbacks(
     for callback in callbacks:
         if callback.where is where:
             callback.func(step, progress)
-
-
-def _require_losses(losses: Mapping[str, Any], kind: type) -> None:
-    """Refuse losses of a model of this class that can't be added up. Raises ConfigError: naming the class and where it
-    is written."""
-    if not losses:
-        raise ConfigError(
-            f"get_loss_dict of {place_of(kind)} gives no loss: training has nothing to make smaller"
-        )
-    for name, loss in losses.items():
-        found = f"a {type(loss).__name__}"
-        if isinstance(loss, Tensor):
-            found = f"a tensor of the shape {tuple(loss.shape)}"
-        if not isinstance(loss, Tensor) or loss.numel() != 1:
-            raise ConfigError(
-                f"the loss {name} of {place_of(kind)} is {found}; expected a tensor of one number, as mean() gives"
-            )
-    if not any(loss.requires_grad for loss in losses.values()):
-        raise ConfigError(
-            f"no loss of {place_of(kind)} depends on a parameter: is something detached, or made under no_grad?"
-        )
 
 
 def prepare_steps(config: TrainerConfig, processes: Processes = ALONE) -> tuple[TrainerConfig, TrainingSteps]:

@@ -1,0 +1,115 @@
+"""The batches of a training step, and their gradients: usually one batch; on a CPU with several threads two.
+
+Most operations of a step are too small for PyTorch to share them among threads: on two cores a quarter of one was in
+use beside the other. So two batches, each of half of the rays, are worked on at once by half of the threads each. Both
+add their gradients to those of the parameters, in either order the same sum; of more than two it would not be, and a
+training could not be repeated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from unmix_plugin.engine.configs import place_of
+from unmix_plugin.engine.model import Model, TrainOutputs
+from unmix_plugin.engine.pipeline import Pipeline
+from unmix_plugin.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class BatchResult:
+    """What a batch gave, whose gradients were added to those of the parameters."""
+
+    outputs: dict[str, Any]
+    losses: dict[str, Tensor]
+    metrics: dict[str, Tensor]
+    loss: Tensor
+    """What of the step's loss is this batch's, without its graph."""
+
+
+def work_on_batches(pipeline: Pipeline, step: int) -> list[BatchResult]:
+    """Work out the batches of training step `step`, and add their gradients to those of the parameters.
+
+    Raises:
+        ConfigError: the model's losses can't be added up.
+    """
+    threads, rays = torch.get_num_threads(), pipeline.datamanager.get_train_rays_per_batch()
+    count = min(pipeline.model.batches_at_once, threads, rays)
+    if count == 1 or pipeline.model.device.type != "cpu":
+        (batch,) = pipeline.train_batches(step)
+        return [_gradients(batch, pipeline.model, 1.0)]
+
+    def work(batch: Callable[[], TrainOutputs]) -> BatchResult:
+        with _num_threads(threads // count):
+            return _gradients(batch, pipeline.model, 1 / count)
+
+    first, *others = pipeline.train_batches(step, count)
+    started = [_workers().submit(work, batch) for batch in others]
+    try:
+        own = work(first)
+    finally:
+        found = [batch.result() for batch in started]
+    return [own, *found]
+
+
+def _gradients(batch: Callable[[], TrainOutputs], model: Model, share: float) -> BatchResult:
+    outputs, losses, metrics = batch()
+    require_losses(losses, type(model))
+    loss = share * torch.stack([loss.reshape(()) for loss in losses.values()]).sum()
+    loss.backward()
+    known = {name: value.detach() for name, value in losses.items()}
+    return BatchResult(outputs, known, metrics, loss.detach())
+
+
+@cache
+def _workers() -> ThreadPoolExecutor:
+    """The thread that works beside the one that trains."""
+    return ThreadPoolExecutor(1, thread_name_prefix="unmix-batch")
+
+
+@contextmanager
+def _num_threads(count: int) -> Iterator[None]:
+    """Context in which the operations that this thread calls are shared among so many threads."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def mean_values(batches: Sequence[BatchResult]) -> dict[str, Tensor]:
+    """Losses and metrics by name, each the mean over the batches that have it."""
+    found = [{**batch.losses, **batch.metrics} for batch in batches]
+    names = dict.fromkeys(name for values in found for name in values)
+    values = {name: [each[name].detach() for each in found if name in each] for name in names}
+    return {name: torch.stack(own).mean(dim=0) for name, own in values.items()}
+
+
+def require_losses(losses: Mapping[str, Any], kind: type) -> None:
+    """Refuse losses of a model of this class that can't be added up. Raises ConfigError: naming the class and where it
+    is written."""
+    if not losses:
+        raise ConfigError(
+            f"get_loss_dict of {place_of(kind)} gives no loss: training has nothing to make smaller"
+        )
+    for name, loss in losses.items():
+        found = f"a {type(loss).__name__}"
+        if isinstance(loss, Tensor):
+            found = f"a tensor of the shape {tuple(loss.shape)}"
+        if not isinstance(loss, Tensor) or loss.numel() != 1:
+            raise ConfigError(
+                f"the loss {name} of {place_of(kind)} is {found}; expected a tensor of one number, as mean() gives"
+            )
+    if not any(loss.requires_grad for loss in losses.values()):
+        raise ConfigError(
+            f"no loss of {place_of(kind)} depends on a parameter: is something detached, or made under no_grad?"
+        )
