@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.factories.ball_views import BOX, RADIUS, SIDE, ball_matter, ball_views, make_cameras
+from tests.factories.ball_views import ABOVE, BOX, RADIUS, SIDE, ball_matter, ball_views, make_cameras
 from tests.factories.scenes import ring_poses
 from unmix_plugin.scenes.geometry.carving import carve_box
 from unmix_plugin.scenes.geometry.lighting import _view_gains, judge_light
@@ -13,6 +13,11 @@ def test_lights_that_move_with_the_camera_or_differ_in_exposure_are_told_from_a_
     log_gains = np.log(np.random.default_rng(1).uniform(0.8, 1.2, 16))
     views = (ball_views(True, noise), ball_views(False, noise), ball_views(False, noise, log_gains))
     assert [judge_light(*each) for each in views] == ["camera", "fixed", "per-view"]
+
+
+def test_what_a_glossy_surface_mirrors_of_a_lamp_above_is_no_light_that_moves():
+    assert judge_light(*ball_views(False, place=ABOVE, gloss=1.0)) == "fixed"
+    assert judge_light(*ball_views(True, gloss=1.0)) == "camera"
 
 
 def test_gains_are_found_exactly_where_places_differ_by_nothing_else():

@@ -6,7 +6,9 @@ bright from all sides. So places on the hull are followed through the views that
 in the camera's frame that tell left from right and up from down are fitted to the changes of their brightness in one
 half of the views. If they predict the changes in the other half, whichever way the views are halved, the light moves.
 Functions that don't tell sides are left out: surfaces seen at a grazing angle look different under any light. So a
-lamp at the camera's very place is not found.
+lamp at the camera's very place is not found. Glossy surfaces look different from all sides under a fixed light, too:
+what they mirror depends on the mirrored direction of view in the world. Where that explains more of the changes, the
+light does not move.
 
 Where exposures differ, all places of a view are brighter or darker than in other views, by the same factor: what one
 half of the places says of the views' gains, the other half says too, whichever way the places are halved. Highlights
@@ -142,7 +144,7 @@ _FoundLight = Literal["fixed", "camera", "per-view"]
 def judge_light(cameras: Cameras, log_brightness: Pictures, hull: Cells, box: SceneBox) -> _FoundLight:
     """Which light the views were taken in; fixed where too little is seen to tell. Arguments as of `seen_places`."""
     places, seen = seen_places(cameras, log_brightness, hull, box)
-    if _foretold_share(cameras, places, seen) > _MOVING_SHARE:
+    if _follows_camera(cameras, places, seen):
         return "camera"
     followed = seen.isfinite().sum(dim=1) >= _FEWEST_VIEWS
     return judge_exposure(cameras, places.positions[followed], seen[followed])
@@ -160,10 +162,11 @@ def judge_exposure(
     return "per-view" if _gain_spread(cameras, positions, seen) > _LEAST_GAIN_SPREAD else "fixed"
 
 
-def _foretold_share(cameras: Cameras, places: Places, seen: Seen) -> float:
-    """Least share of the changes of brightness that the other half of the views predicts; 0 if too little is seen."""
+def _follows_camera(cameras: Cameras, places: Places, seen: Seen) -> bool:
+    """Whether each half of the views predicts the changes of brightness in the other by how surfaces face the camera,
+    and reflections of a fixed light explain no more of them; False if too little is seen."""
     if len(places.positions) == 0:
-        return 0.0
+        return False
     rotations = cameras.camera_to_world[:, :, :3]
     x, y, z = torch.einsum("pi,nij->pnj", places.normals, rotations).unbind(-1)
     turned = torch.stack([x, y, x * z, y * z, x * y], dim=-1)  # polynomials that change sign with x or y
@@ -171,7 +174,12 @@ def _foretold_share(cameras: Cameras, places: Places, seen: Seen) -> float:
     centred = positions - positions.mean(dim=0)
     # The views are cut into two halves, twice (one view: once): along the two axes in which positions vary most.
     along = centred @ torch.linalg.svd(centred, full_matrices=False).Vh[:2].T
-    return _least_share(seen, turned, (along > along.median(dim=0).values).T)
+    if _least_share(seen, turned, (along > along.median(dim=0).values).T) <= _MOVING_SHARE:
+        return False
+    towards = torch.nn.functional.normalize(positions - places.positions[:, None], dim=-1)
+    facing = (towards * places.normals[:, None]).sum(dim=-1, keepdim=True)
+    mirrored = _up_to_second_degree(2 * facing * places.normals[:, None] - towards)
+    return _explained_share(seen, turned) > _explained_share(seen, mirrored)
 
 
 def _gain_spread(cameras: Cameras, positions: Float[Tensor, "P 3"], seen: Seen) -> float:
@@ -186,8 +194,7 @@ def _gain_spread(cameras: Cameras, positions: Float[Tensor, "P 3"], seen: Seen) 
     directions = torch.nn.functional.normalize(
         cameras.camera_to_world[:, :, 3] - positions.mean(dim=0), dim=-1
     )
-    x, y, z = directions.unbind(-1)  # polynomials up to second degree on the sphere
-    smooth = torch.stack([torch.ones_like(x), x, y, z, x * y, y * z, z * x, x * x - y * y, z * z], dim=-1)
+    smooth = torch.cat([torch.ones_like(directions[:, :1]), _up_to_second_degree(directions)], dim=-1)
     shared = []
     for half in (positions > positions.median(dim=0).values).T:
         one, other = _view_gains(seen[half]), _view_gains(seen[~half])
@@ -219,6 +226,19 @@ def _view_gains(seen: Seen) -> Float[Tensor, " N"]:
         errors = (lit - (shares * lit).sum(dim=1, keepdim=True)).abs()
         weights = known / errors.clamp(min=_SMALLEST_ERROR)
     return torch.where(known.any(dim=0), gains, torch.nan).float()
+
+
+def _up_to_second_degree(directions: Float[Tensor, "*D 3"]) -> Float[Tensor, "*D 8"]:
+    """Polynomials of first and second degree on the sphere."""
+    x, y, z = directions.unbind(-1)
+    return torch.stack([x, y, z, x * y, y * z, z * x, x * x - y * y, z * z], dim=-1)
+
+
+def _explained_share(values: Seen, functions: Float[Tensor, "P N F"]) -> float:
+    """Share of the variance within places that a fit to all views explains."""
+    x, y = _changes(values, functions)
+    fit = torch.linalg.lstsq(x, y[:, None]).solution[:, 0]
+    return 1.0 - float((y - x @ fit).square().sum() / y.square().sum())
 
 
 def _least_share(values: Seen, functions: Float[Tensor, "P N F"], halves: Bool[Tensor, "D N"]) -> float:
