@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from tests.factories.files import exposure_of_file, file_of, present, warnings_of
-from unmix_plugin.captures.calibration.exposures import exposure_of
 from unmix_plugin.captures.cube import BandTable, Cube, linear_values
 from unmix_plugin.captures.numbers import Held, Numbers
 from unmix_plugin.captures.readers.band_files import stack_bands
@@ -66,7 +65,7 @@ def test_a_stack_has_one_f_number_and_exposures_that_fit_it(tmp_path):
     def exposure(*apertures):
         facts = [{"time": 0.1} | ({"f_number": f} if f else {}) for f in apertures]
         stack = stack_bands([part(tmp_path, i, **own) for i, own in enumerate(facts)], tmp_path)
-        return exposure_of(stack)
+        return stack.total_exposure()
 
     np.testing.assert_allclose(present(exposure(2.0, 4.0)), [0.1 / 4, 0.1 / 16])
     np.testing.assert_allclose(present(exposure(2.0, 2.0)), [0.1 / 4])
@@ -78,7 +77,7 @@ def test_a_stack_keeps_times_and_gains_without_f_numbers_that_only_some_parts_ha
     facts = [{"time": 0.1, "gain": gain, "f_number": 2.0} for gain in gains]
     del facts[lacking]["f_number"]
     stack = stack_bands([part(tmp_path, i, **own) for i, own in enumerate(facts)], tmp_path)
-    np.testing.assert_allclose(np.broadcast_to(present(exposure_of(stack)), 2), 0.1 * np.array(gains))
+    np.testing.assert_allclose(np.broadcast_to(present(stack.total_exposure()), 2), 0.1 * np.array(gains))
     assert f"is known of some bands and not of {lacking}: exposures are compared" in warnings_of(stack)[0]
 
 

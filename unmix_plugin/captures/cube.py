@@ -296,6 +296,21 @@ class Cube:
         values = values if np.array_equal(rising, indices) else values[..., order]
         return np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("="))
 
+    def total_exposure(self, to_light: bool = True) -> Float64[np.ndarray, " b"] | None:
+        """Exposure time times gain, over the square of the f-number if that is known: what the numbers of one scene
+        grow with. One number, or one a band; None where the file does not say the time.
+
+        Args:
+            to_light: Whether the aperture counts, which lets in light but no dark current.
+        """
+        time, gain, f_number = self.exposure.time, self.exposure.gain, self.exposure.f_number
+        factors = [np.array(factor.numbers) for factor in (time, gain) if factor is not None]
+        if time is None or any(len(factor) not in (1, self.shape[2]) for factor in factors):
+            return None
+        exposure = np.multiply.reduce(np.broadcast_arrays(*factors))
+        exposure = exposure if f_number is None or not to_light else exposure / f_number**2
+        return exposure if np.isfinite(exposure).all() and (exposure > 0).all() else None
+
     def remarking(self, *remarks: Remark) -> Cube:
         """The cube with more remarks."""
         return replace(self, remarks=(*self.remarks, *remarks))

@@ -9,7 +9,7 @@ Notation: `H x W` pixels of the scene, `C` pictures of a view.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,7 +33,8 @@ from unmix_plugin.captures.poses.pose_set import PoseSet
 from unmix_plugin.captures.poses.turntable import poses_from_turntable
 from unmix_plugin.captures.poses.turntable_observations import parse_angles
 from unmix_plugin.captures.posing import lens_of_view
-from unmix_plugin.captures.writing.view_files import FULL_SCALE, ViewRecord
+from unmix_plugin.captures.writing.view_files import FULL_SCALE
+from unmix_plugin.captures.writing.written_views import WrittenViews
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.scenes.reading.cubes import map_array
 
@@ -63,19 +64,17 @@ def marked_poses(plan: Plan, options: ProcessOptions) -> PoseSet:
     return _in_files(plan, replace(found, notes=(*notes, *found.notes)))
 
 
-def poses_of_written_views(
-    plan: Plan, records: Mapping[str, ViewRecord], scene: Path, work: Path, options: ProcessOptions
-) -> PoseSet:
-    """Poses by structure from motion, or of a turntable, on all views.
+def poses_of_written_views(written: WrittenViews, work: Path) -> PoseSet:
+    """Poses by structure from motion, or of a turntable, on all views that are not left out.
 
     Args:
-        records: Of the views, which are all written, in the folder `scene`.
         work: Folder for files of the estimation.
     Returns:
         Poses as `marked_poses` has them; metric and upright where markers of a known size are in view.
     Raises:
         CaptureError: a library is not installed, or the pictures do not tell.
     """
+    plan, options, scene, records = written.plan, written.options, written.folder, written.sound
     shown = {name: np.logical_and(*record.read_masks(scene)) for name, record in records.items()}
     pictures = {
         name: contrast_picture(

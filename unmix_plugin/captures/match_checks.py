@@ -26,6 +26,7 @@ from jaxtyping import Float64, Int
 
 from unmix_plugin.captures.poses.lens import Lens, Points
 from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera, angles_between_axes
+from unmix_plugin.captures.report import Code, Remark
 from unmix_plugin.engine.sampling import evenly_spaced
 
 _LONGEST_SIDE_PX = 320
@@ -129,15 +130,15 @@ class MatchedScene:
         return MatchedScene(stars, cameras[0].lens)
 
 
-def check_matches(scene: MatchedScene, findings: list[str]) -> str:
-    """What was measured in the views of one sensor; what does not fit is appended to findings."""
+def check_matches(scene: MatchedScene) -> list[Remark]:
+    """What was measured in the views of one sensor, and what does not fit."""
     from scipy.optimize import least_squares
 
     stars, lens, count = scene.stars, scene.lens, sum(len(star.ideal) for star in scene.stars)
     if lens is None:
-        return "poses and lens are not compared with matched points: lines of one picture have poses of their own"
+        return [Remark.of(Code.LINES_NOT_MATCHED)]
     if count < _LEAST_POINTS:
-        return "poses and lens are not compared with matched points: too few views share features"
+        return [Remark.of(Code.TOO_FEW_MATCHED)]
 
     def misses(values: np.ndarray) -> np.ndarray:
         found = np.concatenate([star.misses_px(values).reshape(-1, 2) for star in stars])
@@ -159,23 +160,16 @@ def check_matches(scene: MatchedScene, findings: list[str]) -> str:
     corner, moved = lens.ideal_of(np.array([[0.5, 0.5]])), 0.0
     if corner is not None:
         moved = float(np.linalg.norm(lens.pixels_of(_changed(corner, best)) - lens.pixels_of(corner)))
-    measured = (
-        f"{count} points matched in three views or more are seen {before / shrunk:.2f} px from where poses and lens "
-        f"put them ({_PERCENTILE} % of them less)"
-    )
+    missed = {"points": count, "missed": f"{before / shrunk:.2f}", "percentile": _PERCENTILE}
+    left = f"{after / shrunk:.2f}"
+    remarks = [Remark.of(Code.POINTS_MATCHED, **missed)]
     is_better = after < min(_BETTER * before, _POSES_OFF_PX) and np.all(np.abs(best) < 0.99 * _BOUNDS)
     if before > _LEAST_OFF_PX and is_better and moved * shrunk > _LEAST_MOVED_PX and count > _LEAST_FOR_LENS:
-        findings.append(
-            f"the pictures do not fit their lens: {measured}, but {after / shrunk:.2f} px with a focal length of "
-            f"{np.exp(best[0]):.0%} and radial terms that move the corners by {moved:.0f} px: is the lens of another "
-            "model (a fisheye), or given for pictures of another size or crop?"
-        )
+        other = {"left": left, "focal": f"{np.exp(best[0]):.0%}", "moved": f"{moved:.0f}"}
+        remarks.append(Remark.of(Code.LENS_MISFITS, **missed, **other))
     elif after > _POSES_OFF_PX and fitting < _MOST_FITTING:
-        findings.append(
-            f"the pictures do not fit their poses: {measured}, and no lens brings them below {after / shrunk:.2f} px: "
-            "are the poses those of these pictures, and in the convention that their file is read with?"
-        )
-    return measured
+        remarks.append(Remark.of(Code.POSES_MISFIT, **missed, left=left))
+    return remarks
 
 
 def _shrunk(lens: Lens | None) -> float:

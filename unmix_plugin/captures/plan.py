@@ -26,24 +26,21 @@ from unmix_plugin.captures.calibration.calibration import (
     draw_pixels,
     rows_behind,
 )
-from unmix_plugin.captures.calibration.exposures import (
-    ComparedExposures,
-    ExposedFiles,
-    compare_exposures,
-    exposure_of,
-)
 from unmix_plugin.captures.calibration.references import GivenReferences, find_references
 from unmix_plugin.captures.camera_tags import radiometric_model
 from unmix_plugin.captures.cube import Capture, CaptureView, Cube
 from unmix_plugin.captures.decide import (
     LEAST_BRIGHT,
     MOST_ABOVE_ONE,
+    ComparedExposures,
+    ExposedFiles,
     Saturation,
     Scale,
     ValueMeaning,
     background_rule,
     choose_mask,
     choose_scale,
+    compare_exposures,
     find_meaning,
     find_saturation,
     is_below_black,
@@ -53,17 +50,14 @@ from unmix_plugin.captures.decide import (
 )
 from unmix_plugin.captures.options import MaskKind, ProcessOptions
 from unmix_plugin.captures.poses.pose_set import PosedCamera
-from unmix_plugin.captures.posing import PosedViews
 from unmix_plugin.captures.report import Code, Remark
 from unmix_plugin.captures.spoilt import judge_values
 from unmix_plugin.captures.writing.view_files import BackgroundRule, ViewRecipe, alpha_picture
-from unmix_plugin.engine.decisions import UNDECIDED, Decision
 from unmix_plugin.engine.sampling import evenly_spaced
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.scenes.backdrops import Backdrop, judge_backdrop
 from unmix_plugin.spectral.bands import Bands
 
-_BACKDROP_VIEWS = 12
 _BACKDROP_VIEWS = 12
 """Views that a backdrop is looked for in."""
 _WHITE_PERCENTILE = 99.0
@@ -72,8 +66,6 @@ _LEAST_END = 0.9
 """Of what is written as 1: saturated values below are too far off. Columns and bands differ in their ends a little."""
 _FEW_PERCENTILE = 5.0
 """Of saturated values: nearly the darkest."""
-_MOST_LISTED = 4
-"""Views and bands that are left out, in the table of decisions."""
 
 
 @dataclass(frozen=True)
@@ -405,7 +397,7 @@ def with_one_exposure(sensors: dict[str, SensorPlan], first: dict[str, Cube]) ->
         for name in known or rest
         if radiometric_model(first[name]) is None
         # What is wrong with those of one sensor was said of it.
-        and (exposure_of(first[name]) is not None or first[name].exposure.time is None)
+        and (first[name].total_exposure() is not None or first[name].exposure.time is None)
     ]
     if not files:
         return sensors
@@ -468,99 +460,3 @@ def _remarks_on_values(
     if turned := sum(file.orientation != 1 for file in files):
         remarks.append(Remark.of(Code.ORIENTATION_IGNORED, turned=turned, files=len(files)))
     return remarks
-
-
-def decisions_of(
-    plan: Plan, posed: PosedViews, left_out: Sequence[Remark], options: ProcessOptions
-) -> list[Decision]:
-    """The table of all that was decided: what, from what, what would have spoken against it and was looked for, and the
-    option that overrides it. Decisions on single sensors have their names."""
-    reasons = {remark.where[0]: remark.code.name.removeprefix("VIEW_").lower() for remark in left_out}
-    listed = {name: reasons[name].replace("_", " ") for name in [*reasons][:_MOST_LISTED]}
-    more = {"others": len(reasons) - len(listed)} if len(reasons) > len(listed) else {}
-    used = len(posed.views)
-    decisions = [
-        Decision(
-            "views",
-            f"{used} used, {len(reasons)} left out" if reasons else f"all {used} are used",
-            {**listed, **more},
-            "neighbours that are alike, or more than a quarter of the views",
-            "--keep-view, --leave-out",
-        )
-    ]
-    for name, sensor in plan.sensors.items():
-        where, references = f" of {name}" if name else "", sensor.references_used
-        for key, what, outcome, against in (
-            ("dark", "dark frame", "subtracted", "values that pile up below 0"),
-            (
-                *("white", "white reference", "divided by"),
-                "bands in which it is saturated, dark, or not above the dark frame",
-            ),
-        ):
-            if key in references:
-                decisions.append(Decision(f"{what}{where}", outcome, references[key], against, f"--{key}"))
-        exposure, brought = sensor.calibration.exposure, "not compared"
-        if exposure is not None:
-            ends = dict.fromkeys(f"{number:g}" for number in (exposure.min(), exposure.max()))
-            brought = f"all brought to {' to '.join(ends)} s"
-        stored, dropped, nm = sensor.saturation.stored, sensor.bands.dropped, sensor.bands.wavelengths_nm
-        listed = {f"{nm[index]:g} nm": dropped[index].reason for index in sorted(dropped)[:_MOST_LISTED]}
-        more = {"others": len(dropped) - len(listed)} if len(dropped) > len(listed) else {}
-        decisions += [
-            Decision(
-                f"exposure{where}",
-                brought,
-                {},
-                "a time, gain or f-number that one file states and another lacks; values that are reflectance already",
-            ),
-            Decision(
-                f"saturation{where}",
-                UNDECIDED if stored is None else f"from {stored:g}",
-                {"from": sensor.saturation.reason},
-                "numbers that are not whole, or none that crowd at the greatest",
-                "--saturation",
-            ),
-            Decision(
-                f"bands{where}",
-                f"{len(sensor.bands.kept)} of {len(nm)} kept",
-                {**listed, **more},
-                f"more than half of the bands noisier than {options.max_noise:g} of their signal",
-                "--drop-bands, --max-noise",
-            ),
-        ]
-    above = max(
-        (float((sensor.sample > plan.scale.value).mean()) for sensor in plan.sensors.values()), default=0.0
-    )
-    masks = {
-        "auto": "a backdrop that all views share is cut out",
-        "files": "from files",
-        "none": "none: all of each view is the scene",
-    }
-    is_estimated = not posed.poses.has_world
-    has_lines = any(camera.lines is not None for camera in posed.poses.cameras.values())
-    return [
-        *decisions,
-        Decision(
-            "scale",
-            f"{plan.scale.value:g} is written as 1",
-            {"sampled values above": above, "from": plan.scale.reason},
-            "views that are far brighter than most, which it does not follow",
-            "--scale",
-        ),
-        Decision(
-            "mask",
-            masks.get(plan.mask, plan.mask),
-            {"asked": options.mask, **({"backdrop": found} if (found := plan.backdrops_in_words) else {})},
-            "borders with texture, or that differ between views" if options.mask == "auto" else "",
-            "--mask",
-        ),
-        Decision(
-            "poses",
-            f"{'estimated' if is_estimated else 'read'}: {posed.poses.source}",
-            {"views": used},
-            "cameras that jump between lines, or look away from each other"
-            if has_lines
-            else "points shared by views that lie elsewhere by the poses",
-            "--poses" if options.poses is None or not is_estimated else "--poses FILE",
-        ),
-    ]

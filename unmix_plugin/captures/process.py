@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-
-import numpy as np
 
 from unmix_plugin.captures.calibration.references import GivenReferences, require_comparable
 from unmix_plugin.captures.cube import Capture, CaptureView, Cube, ReadOptions
@@ -24,7 +22,7 @@ from unmix_plugin.captures.options import (
     find_views,
     parse_mosaic,
 )
-from unmix_plugin.captures.plan import Plan, decisions_of, make_plan
+from unmix_plugin.captures.plan import Plan, make_plan
 from unmix_plugin.captures.pose_agreement import views_of_other_poses
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.posing import PosedViews, asked_distance, given_poses, pose_views
@@ -33,7 +31,7 @@ from unmix_plugin.captures.report import Code, Kind, Remark, sentences
 from unmix_plugin.captures.spoilt import UnreadableViews, judge_sharpness
 from unmix_plugin.captures.wavelengths import parse_wavelengths
 from unmix_plugin.captures.writing.resampling import Resampling
-from unmix_plugin.captures.writing.scene_files import seen_views, write_scene_files
+from unmix_plugin.captures.writing.scene_files import write_scene_files
 from unmix_plugin.captures.writing.view_files import ViewRecord, write_view
 from unmix_plugin.captures.writing.work_folder import (
     WorkFolder,
@@ -42,6 +40,7 @@ from unmix_plugin.captures.writing.work_folder import (
     input_files,
     refuse_output,
 )
+from unmix_plugin.captures.writing.written_views import WrittenViews, decisions_of, examine
 from unmix_plugin.engine.decisions import decision_table
 from unmix_plugin.engine.runs.replacing import require_apart
 from unmix_plugin.errors import CaptureError, ConfigError, did_you_mean, name_some
@@ -88,77 +87,21 @@ def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list
     left_out |= plan.left_out
     if options.poses == MARKERS:
         say("looking for markers ...")
-        posed = pose_views(_without(plan.views, left_out), marked_poses(plan, options), distance)
+        seeing = [view for view in plan.views if view.name not in left_out]
+        posed = pose_views(seeing, marked_poses(plan, options), distance)
     require_apart(
         (folder.output, folder.path),
         [("the capture's", path) for view in capture.views for path in input_files(view)],
     )
 
-    # Write: view after view, into a folder that an interrupted start may have left.
-    resampled = {} if posed is None else _resampled_lenses(plan, posed)
-    if folder.begin(
-        {**fingerprint(plan, options), "lenses": sorted(numbers for _, numbers in resampled.values())}
-    ):
+    # Write: view after view, into a folder that an interrupted start may have left; where scenes don't have the lens of
+    # a view, its pixels are brought into another one.
+    lenses = {} if posed is None else _resampled_lenses(plan, posed)
+    if folder.begin(fingerprint(plan, options, lenses)):
         say(f"resuming {folder.path}")
-    lenses = {name: lens for name, (lens, _) in resampled.items()}
-    views = follow("writing views", plan.views if posed is None else posed.views)
-    records, unreadable = _write_views(views, plan, lenses, folder)
-
-    # Examine: what is written; views that don't belong are left out of the scene.
-    left_out |= unreadable
-    for sensor in plan.sensors:
-        sharpness = {
-            name: record.sharpness
-            for name, record in records.items()
-            if record.sensor == sensor and name not in plan.left_out
-        }
-        blurred = judge_sharpness(sharpness, cameras)
-        kept = {*left_out, *options.keep_view}
-        left_out |= {name: remark for name, remark in blurred.items() if name not in kept}
-    sound = {name: record for name, record in records.items() if name not in left_out}
-    if all(record.matter_share == 0.0 for record in sound.values()):
-        raise CaptureError(
-            f"{capture.root}: no view shows anything but background, by its mask ({plan.mask}); look at "
-            f"{folder.path / 'images'} and choose another --mask, or none"
-        )
-    if posed is None:
-        say("estimating poses ...")
-        found = poses_of_written_views(plan, sound, folder.path, folder.poses, options)
-        posed = pose_views(_without(plan.views, left_out), found, distance)
-        refuse_late_lenses(_resampled_lenses(plan, posed))
-    for note in sentences(posed.remarks, Kind.DONE):
-        say(f"poses: {note}")
-    posed = replace(posed, views=tuple(_without(posed.views, left_out)))
-    if options.poses not in (ESTIMATE, TURNTABLE):  # which the pictures themselves decide
-        seen = [view for view in seen_views(folder.path, plan, posed, records) if view.camera.lines is None]
-        for sensor in plan.sensors:
-            others = views_of_other_poses([view for view in seen if view.record.sensor == sensor])
-            left_out |= {name: remark for name, remark in others.items() if name not in options.keep_view}
-        posed = replace(posed, views=tuple(_without(posed.views, left_out)))
-    reasons = [*left_out.values()]
-    decided = decisions_of(plan, posed, reasons, options)
-    for line in decision_table(decided):
-        say(line)
-    findings = write_scene_files(
-        folder.path,
-        plan,
-        posed,
-        records,
-        options=options,
-        left_out=reasons,
-        decided=decided,
-    )
-    return [*findings, *folder.finish(options.overwrite)]
-
-
-def _write_views(
-    views: Iterable[CaptureView], plan: Plan, lenses: Mapping[str, Lens], folder: WorkFolder
-) -> tuple[dict[str, ViewRecord], dict[str, Remark]]:
-    """Write the files of all views that are not there yet, brought into other lenses where there are such; gives their
-    records and why others can't be read, by name. Raises CaptureError: too many can't be."""
     records: dict[str, ViewRecord] = {}
     unreadable = UnreadableViews(len(plan.views))
-    for view in views:
+    for view in follow("writing views", plan.views if posed is None else posed.views):
         record = folder.done(view.name)
         if record is None:
             into = Resampling.into(lenses[view.name]) if view.name in lenses else None
@@ -168,11 +111,38 @@ def _write_views(
                 folder.note(record)
         if record is not None:
             records[view.name] = record
-    return records, unreadable.remarks
+    written = WrittenViews(folder.path, plan, options, records, left_out | unreadable.remarks)
 
-
-def _without(views: Iterable[CaptureView], left_out: Collection[str]) -> list[CaptureView]:
-    return [view for view in views if view.name not in left_out]
+    # Examine: views that don't belong are left out of the scene.
+    for sensor in plan.sensors:
+        judged = [one for one in records.values() if one.sensor == sensor and one.name not in plan.left_out]
+        sharpness = {record.name: record.sharpness for record in judged}
+        written = written.without(judge_sharpness(sharpness, cameras))
+    if all(record.matter_share == 0.0 for record in written.sound.values()):
+        raise CaptureError(
+            f"{capture.root}: no view shows anything but background, by its mask ({plan.mask}); look at "
+            f"{folder.path / 'images'} and choose another --mask, or none"
+        )
+    if posed is None:
+        say("estimating poses ...")
+        found = poses_of_written_views(written, folder.poses)
+        posed = pose_views(written.remaining(plan.views), found, distance)
+        refuse_late_lenses(_resampled_lenses(plan, posed))
+    for note in sentences(posed.remarks, Kind.DONE):
+        say(f"poses: {note}")
+    posed = replace(posed, views=written.remaining(posed.views))
+    if options.poses not in (ESTIMATE, TURNTABLE):  # which the pictures themselves decide
+        seen = [view for view in written.seen(posed) if view.camera.lines is None]
+        for sensor in plan.sensors:
+            same = [view for view in seen if view.record.sensor == sensor]
+            written = written.without(views_of_other_poses(same))
+        posed = replace(posed, views=written.remaining(posed.views))
+    decided = decisions_of(written, posed)
+    for line in decision_table(decided):
+        say(line)
+    findings = examine(written, posed)
+    write_scene_files(written, posed, decided, findings)
+    return [*findings.wrong, *folder.finish(options.overwrite)]
 
 
 def _wanted_views(capture: Capture, options: ProcessOptions) -> tuple[list[CaptureView], dict[str, Remark]]:
@@ -186,31 +156,25 @@ def _wanted_views(capture: Capture, options: ProcessOptions) -> tuple[list[Captu
                 raise ConfigError(
                     f"{flag} {name}: no view of this name; there are {name_some(names, 5)}{hint}"
                 )
-    left_out = dict(capture.unreadable)
     unreadable = UnreadableViews(len(names))
-    wanted = _without(capture.views, options.leave_out)
+    wanted = [view for view in capture.views if view.name not in options.leave_out]
     for view in wanted:
         with unreadable.noted(view.name):
             for row in sorted({0, view.cube.shape[0] // 2, view.cube.shape[0] - 1}):
                 view.cube.read(slice(row, row + 1))
-    left_out |= unreadable.remarks
+    left_out = {**capture.unreadable, **unreadable.remarks}
     left_out |= {name: Remark.of(Code.VIEW_NOT_WANTED, [name]) for name in options.leave_out}
-    return _without(wanted, left_out), left_out
+    return [view for view in wanted if view.name not in left_out], left_out
 
 
-def _resampled_lenses(plan: Plan, posed: PosedViews) -> dict[str, tuple[Lens, list[float]]]:
-    """Lenses of the views whose pixels are brought into another lens, as the scene has them, and numbers that tell each
-    from others."""
-    probe, found = np.array([[0.0, 0.0], [0.2, 0.0], [0.0, 0.3], [-0.3, 0.2]]), {}
+def _resampled_lenses(plan: Plan, posed: PosedViews) -> dict[str, Lens]:
+    """Lenses of the views whose pixels are brought into another lens, as the scene has them, by name."""
+    lenses = {}
     for view in posed.views:
         lens = posed.poses.cameras[view.name].lens
         if lens is not None and lens.resampled_from is not None:
-            lens = plan.recipes[view.sensor].calibration.raster.lens(lens)
-            assert lens.resampled_from is not None
-            seen = lens.resampled_from(probe).ravel().tolist()
-            numbers = [*lens.focal_px, *lens.center_px, *lens.distortion, *lens.higher_radial, *seen]
-            found[view.name] = lens, numbers
-    return found
+            lenses[view.name] = plan.recipes[view.sensor].calibration.raster.lens(lens)
+    return lenses
 
 
 def refuse_late_lenses(lenses: Collection[str]) -> None:

@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     from unmix_plugin.engine.decisions import Decision
 
 _WIDTH = 110
+_MATCHED = (
+    "{points} points matched in three views or more are seen {missed} px from where poses and lens put them "
+    "({percentile} % of them less)"
+)
 
 
 class Kind(Enum):
@@ -426,6 +430,22 @@ class Code(Enum):
     BANDS_ODD = _wrong(
         "{bands:band} off against both neighbours by one factor in all views and materials: {named}: a gain that was "
         "not applied, or a line of the lamp without a white reference; leave such bands out with --drop-bands"
+    )
+    LINES_NOT_MATCHED = _measured(
+        "poses and lens are not compared with matched points: lines of one picture have poses of their own"
+    )
+    TOO_FEW_MATCHED = _measured(
+        "poses and lens are not compared with matched points: too few views share features"
+    )
+    POINTS_MATCHED = _measured(_MATCHED)
+    LENS_MISFITS = _wrong(
+        f"the pictures do not fit their lens: {_MATCHED}, but {{left}} px with a focal length of {{focal}} and radial "
+        "terms that move the corners by {moved} px: is the lens of another model (a fisheye), or given for pictures of "
+        "another size or crop?"
+    )
+    POSES_MISFIT = _wrong(
+        f"the pictures do not fit their poses: {_MATCHED}, and no lens brings them below {{left}} px: are the poses "
+        "those of these pictures, and in the convention that their file is read with?"
     )
     MASKS_INVERTED = _wrong(
         "{views:view} whose foreground is black while the background has light and texture ({named:5}): are the masks "

@@ -17,8 +17,8 @@ from tests.factories.captures import (
     write_poses,
 )
 from tests.factories.files import exposure_of_file, file_of, present
-from unmix_plugin.captures.calibration.exposures import ExposedFiles, compare_exposures, exposure_of
 from unmix_plugin.captures.cube import Exposure, Linear, Meaning
+from unmix_plugin.captures.decide import ExposedFiles, compare_exposures
 from unmix_plugin.captures.fields import state_exposure
 from unmix_plugin.captures.report import Code, Kind, Remark, sentences
 
@@ -130,7 +130,7 @@ def test_views_are_brought_to_the_white_and_that_is_said():
     same = compared([exposed(0.01)] * 2, [exposed(0.01)], [(exposed(0.01), exposed(0.01))])
     assert (same.notes, same.warnings) == ([], [])
     bands = exposed([0.01, 0.02, 0.04])  # which may differ within a view
-    np.testing.assert_array_equal(exposure_of(bands), [0.01, 0.02, 0.04])
+    np.testing.assert_array_equal(bands.total_exposure(), [0.01, 0.02, 0.04])
     np.testing.assert_array_equal(compared([bands]).common, [0.02])
 
 
@@ -156,7 +156,7 @@ def test_the_aperture_counts_for_light_and_not_for_dark_current():
 
     views = [taken(0.01, 4.0), taken(0.02, 4.0 * 2**0.5), taken(0.04, 8.0)]  # the same light
     found = compared(views)
-    np.testing.assert_allclose([present(exposure_of(view)) for view in views], 0.01 / 16)
+    np.testing.assert_allclose([present(view.total_exposure()) for view in views], 0.01 / 16)
     np.testing.assert_allclose(present(found.common), 0.01 / 16)
     brighter = compared([*views, taken(0.01, 2.0)], [], [(taken(0.01, 16.0), views[0])])
     assert " s over the square of the f-number: each is brought to" in brighter.notes[0]

@@ -19,7 +19,6 @@ from itertools import product
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, Shaped, UInt8
 
-from unmix_plugin.captures.calibration.exposures import exposure_of
 from unmix_plugin.captures.calibration.references import (
     Reference,
     SensorReferences,
@@ -140,8 +139,8 @@ class Calibration:
     saturation: float | None = None
     """Stored number of a saturated pixel; None where none is known."""
     exposure: Float64[np.ndarray, " b"] | None = None
-    """Exposure (see `exposure_of`) that values are brought to, one number or one a band of the file: that of the white
-    reference, otherwise of the first view; None where exposures are not compared."""
+    """Exposure (`Cube.total_exposure`) that values are brought to, one number or one a band of the file: that of the
+    white reference, otherwise of the first view; None where exposures are not compared."""
 
     @property
     def num_bands(self) -> int:
@@ -175,9 +174,9 @@ class Calibration:
         dark, white = used.dark, used.white
         if dark is not None:
             values -= dark.rows(rows, columns, self.bands)
-        factor, wanted, found = np.ones(1, np.float32), self.exposure, exposure_of(file)
+        factor, wanted, found = np.ones(1, np.float32), self.exposure, file.total_exposure()
         if file.path in self.references.by_view and white is not None and wanted is not None:
-            wanted = exposure_of(white.file)  # its own white reference
+            wanted = white.file.total_exposure()  # its own white reference
         if wanted is not None and found is not None:
             ratio = (wanted / found).astype(np.float32)
             factor = ratio if len(ratio) == 1 else ratio[self.bands]

@@ -19,10 +19,15 @@ from unmix_plugin.captures.calibration.calibration import (
     bright_values,
     count_stored,
 )
-from unmix_plugin.captures.calibration.exposures import ExposedFiles, compare_exposures
 from unmix_plugin.captures.calibration.references import GivenReferences, SensorReferences, find_references
 from unmix_plugin.captures.cube import CaptureView, Cube, Meaning, find_missing
-from unmix_plugin.captures.decide import find_saturation, may_be_reflectance, saturated_bands
+from unmix_plugin.captures.decide import (
+    ExposedFiles,
+    compare_exposures,
+    find_saturation,
+    may_be_reflectance,
+    saturated_bands,
+)
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.report import Kind, sentences
 from unmix_plugin.captures.writing.view_files import read_view_masks

@@ -1,5 +1,5 @@
-"""What is written once all views are there: cameras, light, points, the report in words, the record, and the contact
-sheet, one picture of every view with its mask, of cameras and points from above, and of mean spectra.
+"""What is written beside the views: cameras, light, points, the report in words, the record, and the contact sheet, one
+picture of every view with its mask, of cameras and points from above, and of mean spectra.
 
 Notation: `h x w` pixels of a small picture, `B` bands.
 """
@@ -7,9 +7,9 @@ Notation: `h x w` pixels of a small picture, `B` bands.
 from __future__ import annotations
 
 import textwrap
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -17,30 +17,22 @@ import numpy as np
 from jaxtyping import UInt8
 
 from unmix_plugin import __version__
-from unmix_plugin.captures.calibration.bands import BandFault
 from unmix_plugin.captures.checks import (
     SeenView,
-    ViewSample,
-    angles_between,
-    check_files,
-    check_values,
-    check_views,
 )
 from unmix_plugin.captures.cube import CaptureView
-from unmix_plugin.captures.match_checks import MatchedScene, check_matches
-from unmix_plugin.captures.options import ProcessOptions, plain_options
+from unmix_plugin.captures.options import plain_options
 from unmix_plugin.captures.plan import Plan, SensorPlan
-from unmix_plugin.captures.poses.line_motion import averaged_lines, middle_of
 from unmix_plugin.captures.poses.pose_set import PoseSet
 from unmix_plugin.captures.posing import PosedViews
-from unmix_plugin.captures.report import Kind, Remark, report_text, sentences
-from unmix_plugin.captures.writing.view_files import FULL_SCALE, BackgroundRule, ViewRecord
+from unmix_plugin.captures.report import Kind, report_text, sentences
+from unmix_plugin.captures.writing.view_files import FULL_SCALE, ViewRecord
 from unmix_plugin.captures.writing.work_folder import RECORD_NAME, hashes
+from unmix_plugin.captures.writing.written_views import Findings, WrittenViews, what_was_done
 from unmix_plugin.engine.decisions import Decision
 from unmix_plugin.engine.printing import plot_text, terminal_text
 from unmix_plugin.engine.runs.atomic_files import write_file
 from unmix_plugin.engine.sampling import evenly_spaced
-from unmix_plugin.errors import counted, name_some
 from unmix_plugin.figures.pictures import Canvas, CanvasLayout, columns_for
 from unmix_plugin.figures.plotting import FIGURE_DPI, figure_bytes, plain_axes
 from unmix_plugin.formats.meshes import write_ply
@@ -50,64 +42,14 @@ from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectr
 
 _SCENE_NAME, _SHEET_NAME, _REPORT_NAME = "transforms.json", "contact-sheet.png", "report.txt"
 _ILLUMINANT_NAME, _FLAT_LIGHT_NAME, _POINTS_NAME = "illuminant.csv", "flat-light.csv", "points.ply"
-_MOST_BANDS = 8
-"""Bands left out for one reason that are named."""
-
-
-def seen_views(
-    folder: Path, plan: Plan, posed: PosedViews, records: Mapping[str, ViewRecord]
-) -> list[SeenView]:
-    """The views that have poses and are written, with the lenses of their pictures."""
-    seen = []
-    for view in posed.views:
-        if view.name in records:
-            record, camera = records[view.name], posed.poses.cameras[view.name]
-            assert camera.lens is not None
-            raster = plan.sensors[view.sensor].calibration.raster
-            camera = replace(camera, lens=raster.lens(camera.lens))
-            if camera.lines is not None:
-                lines = averaged_lines(camera.lines, raster.top, raster.height, raster.binning)
-                camera = replace(camera, camera_to_world=middle_of(lines), lines=lines)
-            seen.append(SeenView(record, camera, folder / record.paths["file_path"]))
-    return seen
-
-
-def _greatest_sensor(seen: Sequence[SeenView]) -> str:
-    """The sensor that took the most views."""
-    ((greatest, _),) = Counter(view.record.sensor for view in seen).most_common(1)
-    return greatest
-
-
-def _matched(seen: Sequence[SeenView]) -> MatchedScene:
-    """What the views share of the sensor that took the most; nothing is matched between pictures of line cameras, which
-    no fundamental matrix explains."""
-    if any(view.camera.lines is not None for view in seen):
-        return MatchedScene((), None)
-    greatest = _greatest_sensor(seen)
-    return MatchedScene.of([(view.camera, view.picture) for view in seen if view.record.sensor == greatest])
 
 
 def write_scene_files(
-    folder: Path,
-    plan: Plan,
-    posed: PosedViews,
-    records: dict[str, ViewRecord],
-    *,
-    options: ProcessOptions,
-    left_out: Sequence[Remark] = (),
-    decided: Sequence[Decision] = (),
-) -> list[str]:
-    """Write transforms.json, light, points, contact sheet, report and record.
-
-    Args:
-        records: Of the views that are written, with some that are left out.
-        left_out: Why views are left out, one each.
-        decided: For the report.
-    Returns:
-        What looks wrong, one sentence each.
-    Raises:
-        RunError: the folder can't be written.
-    """
+    written: WrittenViews, posed: PosedViews, decided: Sequence[Decision], found: Findings
+) -> None:
+    """Write transforms.json, light, points, contact sheet, report and record beside the views. Raises RunError: the
+    folder can't be written."""
+    folder, plan, left_out = written.folder, written.plan, written.left_out
     keys = posed.keys | write_points(folder, posed.poses)
     # Reflectances are seen in a flat light. Where they were divided by a scale, a perfect white is stored as 1 over it,
     # which readers make the power of this light: whatever is divided by it is reflectance again. Where nobody says what
@@ -123,62 +65,48 @@ def write_scene_files(
         write_spectra_csv(folder / _FLAT_LIGHT_NAME, flat)
         keys["illuminant_path"] = _FLAT_LIGHT_NAME
         keys |= {} if scale == 1.0 else {"reflectance_of_1": scale}
-    seen = seen_views(folder, plan, posed, records)
-    # Views of sensors with other bands can't be compared with those of the one that took the most.
-    bands_nm = plan.sensors[_greatest_sensor(seen)].centers_nm
-    alike = {name for name, sensor in plan.sensors.items() if np.array_equal(sensor.centers_nm, bands_nm)}
-    findings = sentences(left_out, Kind.WRONG)
-    findings += dict.fromkeys((*sentences(plan.remarks, Kind.WRONG), *posed.poses.warnings))
-    checked = check_views([v for v in seen if v.record.sensor in alike], posed.poses.points)
-    checked += [*posed.remarks, *check_files(posed.views, options)]
-    for name, sensor in plan.sensors.items():
-        same = [view for view in seen if view.record.sensor == name]
-        samples = [ViewSample.of(view.record, folder) for view in same]
-        checked += check_values(samples, angles_between(same), sensor.centers_nm)
-    findings += sentences(checked, Kind.WRONG)
-    measured = [*sentences(checked, Kind.MEASURED), check_matches(_matched(seen), findings)]
 
-    sizes = []
+    # For people: the report and the contact sheet.
+    seen, sizes = written.seen(posed), []
     for name, sensor in plan.sensors.items():
         raster, centers = sensor.calibration.raster, sensor.centers_nm
         bands = f"1 band at {centers[0]:g} nm" if len(centers) == 1 else str(Bands(centers))
         sizes.append(f"{name + ': ' if name else ''}{raster.height} x {raster.width} pixels, {bands}")
     title = f"{plan.capture.root}: {len(seen)} views, {'; '.join(sizes)}"
-    done = sentences(left_out, Kind.DONE) + _what_was_done(plan, posed, [view.record for view in seen])
-    report = report_text(title, findings, measured, done, decided)
+    done = sentences(left_out.values(), Kind.DONE) + what_was_done(written, posed)
+    report = report_text(title, found.wrong, found.measured, done, decided)
     write_file(folder / _REPORT_NAME, terminal_text(report).encode())
-    reasons = {remark.where[0]: remark for remark in left_out}
-    spoilt = [record for name, record in records.items() if name in reasons]
+    spoilt = [record for name, record in written.records.items() if name in left_out]
     write_file(folder / _SHEET_NAME, contact_sheet(seen, plan.sensors, posed.poses, title, spoilt))
+
+    # For programs: how the scene was made, and the scene.
     views = [asdict(view.record) for view in seen]
     totals = ("num_pixels", "saturated_pixels", "missing_pixels", "clipped_values", "negative_values")
     record = {
         "made_by": f"unmix-process {__version__}",
-        "options": plain_options(options),
+        "options": plain_options(written.options),
         "decisions": plan.decisions,
         "decided": [decision.to_json() for decision in decided],
-        "stored": {"type": "uint16", "value_scale": FULL_SCALE, "calibrated_value_of_1": plan.scale.value},
+        "stored": {"type": "uint16", "value_scale": FULL_SCALE, "calibrated_value_of_1": scale},
         "poses": {"source": posed.poses.source, "notes": sentences(posed.remarks, Kind.DONE), **posed.keys},
         "notes": sentences(plan.remarks, Kind.DONE),
-        "what_looks_wrong": findings,
-        "left_out": [remark.to_json() for remark in left_out],
-        "measured": measured,
+        "what_looks_wrong": found.wrong,
+        "left_out": [remark.to_json() for remark in left_out.values()],
+        "measured": found.measured,
         "totals": {key: sum(view[key] for view in views) for key in totals},
         "references": hashes(plan.option_files),
         "views": views,
     }
     write_file(folder / RECORD_NAME, transforms_bytes(record))
-
     others = []
-    for name, remark in reasons.items():
+    for name, remark in left_out.items():
         reason = remark.code.name.lower().replace("_", " ").removeprefix("view ")
-        paths = records[name].paths if name in records else {}
+        paths = written.records[name].paths if name in written.records else {}
         others.append({"name": name, "reason": reason, **paths})
     keys |= {"left_out": others} if others else {}
     markers = {name: corners.tolist() for name, corners in posed.poses.markers.items()}
     keys |= {"markers": markers} if markers else {}
     write_file(folder / _SCENE_NAME, transforms_bytes(_transforms_json(plan, posed.views, seen, keys)))
-    return findings
 
 
 def write_points(folder: Path, poses: PoseSet) -> dict[str, str]:
@@ -251,61 +179,6 @@ def _transforms_json(
         **splits,
         "frames": frames,
     }
-
-
-def _what_was_done(plan: Plan, posed: PosedViews, views: Sequence[ViewRecord]) -> list[str]:
-    """Decisions and totals, one sentence each."""
-    lines = []
-    for name, sensor in plan.sensors.items():
-        where, used = f"{name}: " if name else "", sensor.references_used
-        lines.append(
-            f"{where}values are {sensor.meaning.description}; wavelengths from {sensor.bands.source}"
-        )
-        for key, what in (("dark", "dark frame"), ("white", "white reference")):
-            lines += [f"{where}{what}: {used[key]['use']}"] if key in used else []
-        stored, reason = sensor.saturation.stored, sensor.saturation.reason
-        lines.append(f"{where}saturation: {reason if stored is None else f'from {stored:g} ({reason})'}")
-        dropped: dict[str, list[str]] = defaultdict(list)
-        for index, band in sorted(sensor.bands.dropped.items()):
-            reason = "noisy" if band.fault is BandFault.NOISY else band.reason
-            dropped[reason].append(f"{sensor.bands.wavelengths_nm[index]:g} nm")
-        lines += [
-            f"{where}bands left out: {name_some(names, _MOST_BANDS)} ({reason})"
-            for reason, names in dropped.items()
-        ]
-    lines.append(
-        f"{plan.scale.value:g} is written as 1: {plan.scale.reason}; full scale of the cubes is {FULL_SCALE}"
-    )
-
-    def total(what: str) -> str:
-        noun = what.rpartition("_")[2].removesuffix("s")
-        return counted(sum(getattr(view, what) for view in views), noun)
-
-    num_values = sum(view.num_pixels * len(plan.sensors[view.sensor].centers_nm) for view in views)
-    negative = sum(view.negative_values for view in views) / max(num_values, 1)
-    lines.append(
-        f"{total('saturated_pixels')} with saturated bands, which are written as 1; {total('clipped_values')} above 1, "
-        f"written as 1 too; {total('negative_values')} below 0 ({negative:.1%} of all), written as 0; "
-        f"{total('missing_pixels')} masked, as nothing was measured there"
-    )
-    share = f"{np.mean([view.matter_share for view in views]):.0%} of the pixels are foreground"
-    found = plan.backdrops_in_words
-    changed = f"{total('specks')} removed, {total('holes')} filled"
-    if found:
-        whole = sum(view.matter_share == 1.0 for view in views)
-        lines.append(
-            f"backdrop found, {found}: {share}, the rest is cut out with soft "
-            f"edges; {changed}" + (f"; {counted(whole, 'view')} without any of it" if whole else "")
-        )
-    elif plan.mask == "none":
-        lines.append("no mask of the foreground: all of each image belongs to the scene")
-    elif plan.mask == "files":
-        lines.append(f"masks from files; {share}")
-    else:
-        rules = [r.background for r in plan.recipes.values() if isinstance(r.background, BackgroundRule)]
-        levels = ", ".join(f"{rule.level:.3f} (threshold {rule.threshold:.3f})" for rule in rules)
-        lines.append(f"{plan.mask} background at {levels}; {share}; {changed}")
-    return [*lines, *(text for one in (posed, plan) for text in sentences(one.remarks, Kind.DONE))]
 
 
 # The contact sheet.

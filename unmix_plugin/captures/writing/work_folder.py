@@ -6,16 +6,19 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from unmix_plugin import __version__
 from unmix_plugin.captures.cube import CaptureView
 from unmix_plugin.captures.options import ProcessOptions, plain_options
 from unmix_plugin.captures.plan import Plan
 from unmix_plugin.captures.poses.estimation import WORK_FILES
+from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.pose_set import reading
 from unmix_plugin.captures.writing.view_files import ViewRecord
 from unmix_plugin.engine.runs.atomic_files import make_folder, write_errors_as, write_file
@@ -157,9 +160,9 @@ def _json(value: Any) -> bytes:
     return (json.dumps(value, indent=1, sort_keys=True) + "\n").encode()
 
 
-def fingerprint(plan: Plan, options: ProcessOptions) -> dict[str, Any]:
-    """What must be the same for views to be used again: options, decisions and input files. Raises CaptureError: a
-    file can't be read."""
+def fingerprint(plan: Plan, options: ProcessOptions, lenses: Mapping[str, Lens]) -> dict[str, Any]:
+    """What must be the same for views to be used again: options, decisions, input files, and the lenses that pixels are
+    brought into, by view. Raises CaptureError: a file can't be read."""
     free = [
         "output_dir",
         "overwrite",
@@ -179,6 +182,11 @@ def fingerprint(plan: Plan, options: ProcessOptions) -> dict[str, Any]:
         with reading(file):
             facts = file.stat()
         stamps.append([os.fspath(file.absolute()), facts.st_size, facts.st_mtime_ns])
+    probe, of_lenses = np.array([[0.0, 0.0], [0.2, 0.0], [0.0, 0.3], [-0.3, 0.2]]), []
+    for lens in lenses.values():
+        assert lens.resampled_from is not None
+        seen = lens.resampled_from(probe).ravel().tolist()
+        of_lenses.append([*lens.focal_px, *lens.center_px, *lens.distortion, *lens.higher_radial, *seen])
     # What transforms.json states may change while its poses, which views don't depend on, are mended.
     stated = [view.cube.linear for view in plan.views if view.cube.linear is not None]
     return {
@@ -188,6 +196,7 @@ def fingerprint(plan: Plan, options: ProcessOptions) -> dict[str, Any]:
         "bands": {name: sensor.centers_nm.tolist() for name, sensor in plan.sensors.items()},
         "gains": sorted({repr((one.gains.tolist(), one.offsets.tolist())) for one in stated}),
         "files": stamps,
+        "lenses": sorted(of_lenses),
     }
 
 
