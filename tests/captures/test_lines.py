@@ -11,13 +11,13 @@ from scipy.spatial.transform import Rotation
 from tests.factories.captures import HEIGHT, WIDTH, make_capture, process
 from tests.factories.commands import done
 from unmix_plugin.captures import demo as demo_capture
-from unmix_plugin.captures.demo import make_demo_capture
-from unmix_plugin.captures.demo_lines import (
+from unmix_plugin.captures.demo import (
     FIELD_OF_VIEW_DEG,
     LINE_POSES,
     SCANNED,
     STAGES,
     STAGES_FILE,
+    make_demo_capture,
     scanning_cameras,
 )
 from unmix_plugin.commands.process import process as process_command

@@ -138,15 +138,17 @@ def _write_capture(options: _DemoSceneOptions) -> None:
 
 
 def _write_scans(options: _DemoSceneOptions) -> None:
-    from unmix_plugin.captures.demo import RAW_BANDS, RAW_LAMP, make_demo_capture
-    from unmix_plugin.captures.demo_lines import (
+    from unmix_plugin.captures.demo import (
         FIELD_OF_VIEW_DEG,
         LINE_POSES,
         LINE_SCANS,
         LINE_SIZE,
+        RAW_BANDS,
+        RAW_LAMP,
         SCANNED,
         STAGES,
         STAGES_FILE,
+        make_demo_capture,
     )
     from unmix_plugin.commands.reporting import CommandConsole, follow, shell_line
     from unmix_plugin.spectral.colour.conversion import parse_light

@@ -86,7 +86,11 @@ def poses_from_markers(
     found = replace(found, sizes=np.ones(len(found.sizes)))
     found, kept = _adjust(found, seen, free, same_size=True)
     _refuse_moved(found, seen, kept)
-    found = _with_distortion(found, seen.part(kept), free)
+    if free.any():  # k1 and k2 are estimated too, where that is better
+        part = seen.part(kept)
+        distorted = solve(found, part, free, same_size=True, with_distortion=True)
+        before, after = (float(np.sqrt(np.mean(one.misses(part) ** 2))) for one in (found, distorted))
+        found = distorted if after < (1.0 - _GAIN) * before else found
     poses = _pose_set(found, seen, kept, sightings, marker_size, free)
     return replace(poses, notes=(*poses.notes, folded)) if folded else poses
 
@@ -216,7 +220,10 @@ class _Chain:
             misses = np.sum([self._misses(options @ pose, s) for s, pose in known], axis=0)
             corners = np.concatenate([transformed(pose, SQUARE) for _, pose in known])
             ideal = np.concatenate([self._ideal[s] for s, _ in known])
-            options = _resected(options[int(np.argmin(misses))], corners, ideal)[None]
+            first, cv2 = options[int(np.argmin(misses))], require_opencv()
+            turn, shift = cv2.Rodrigues(first[:3, :3])[0], first[:3, 3:].copy()
+            refined = cv2.solvePnPRefineLM(corners, ideal[:, None].copy(), np.eye(3), None, turn, shift)
+            options = _transform(*refined)[None]
         self._options[view] = options
 
     def _place_next(self) -> int | None:
@@ -249,16 +256,6 @@ def _square_poses(ideal: Float64[np.ndarray, "4 2"]) -> Float64[np.ndarray, "2 4
     return np.stack([*poses, np.eye(4), np.eye(4)][:2])
 
 
-def _resected(
-    first: Float64[np.ndarray, "4 4"], points: Float64[np.ndarray, "P 3"], ideal: Float64[np.ndarray, "P 2"]
-) -> Float64[np.ndarray, "4 4"]:
-    """The camera with the least squares for points, from a first one."""
-    cv2 = require_opencv()
-    turn = cv2.Rodrigues(first[:3, :3])[0]
-    found = cv2.solvePnPRefineLM(points, ideal[:, None].copy(), np.eye(3), None, turn, first[:3, 3:].copy())
-    return _transform(*found)
-
-
 def _transform(turn: np.ndarray, shift: np.ndarray) -> Float64[np.ndarray, "4 4"]:
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = require_opencv().Rodrigues(turn)[0], np.ravel(shift)
@@ -277,18 +274,6 @@ def _adjust(
     misses = found.misses(seen)
     kept = misses < max(_OUTLIER_PX, _OUTLIER_FACTOR * float(np.median(misses[usable])))
     return solve(found, seen.part(kept), free, same_size, steps=steps), kept
-
-
-def _with_distortion(found: MarkerMap, seen: Seen, free: Bool[np.ndarray, " L"]) -> MarkerMap:
-    """The map with k1 and k2 estimated too, where that is better."""
-    if not free.any():
-        return found
-    distorted = solve(found, seen, free, same_size=True, with_distortion=True)
-    before, after = (float(np.sqrt(np.mean(one.misses(seen) ** 2))) for one in (found, distorted))
-    return distorted if after < (1.0 - _GAIN) * before else found
-
-
-# What is refused, and the result.
 
 
 def _refuse_several_sizes(found: MarkerMap, seen: Seen, kept: Bool[np.ndarray, " S"]) -> None:

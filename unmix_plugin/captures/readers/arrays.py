@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from unmix_plugin.captures.band_entries import GOOD, NAMES, check_bands, counts_bands, says_bands, state_bands
 from unmix_plugin.captures.cube import (
     Cube,
     Linear,
@@ -23,17 +24,11 @@ from unmix_plugin.captures.cube import (
     linear_values,
 )
 from unmix_plugin.captures.fields import (
-    GOOD,
-    NAMES,
     OF_ALL_IMAGES,
     Format,
-    check_bands,
-    counts_bands,
     is_exposure,
     listed,
     plain_names,
-    says_bands,
-    state_bands,
     state_exposure,
     state_linear,
 )

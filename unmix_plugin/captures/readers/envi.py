@@ -6,15 +6,9 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
+from unmix_plugin.captures.band_entries import check_bands, state_bands
 from unmix_plugin.captures.cube import Cube, Exposure, ReadOptions
-from unmix_plugin.captures.fields import (
-    Format,
-    check_bands,
-    listed,
-    state_bands,
-    state_exposure,
-    state_linear,
-)
+from unmix_plugin.captures.fields import Format, listed, state_exposure, state_linear
 from unmix_plugin.captures.numbers import Mapped, Numbers
 from unmix_plugin.captures.report import Code, Remark
 from unmix_plugin.errors import CaptureError

@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import Any, TypeAlias
 from xml.etree.ElementTree import Element
 
+from unmix_plugin.captures.band_entries import check_bands, state_bands
 from unmix_plugin.captures.cube import Cube, Linear, Meaning
-from unmix_plugin.captures.fields import Format, check_bands, plain_names, state_bands, state_linear
+from unmix_plugin.captures.fields import Format, plain_names, state_linear
 from unmix_plugin.captures.report import Code, Remark
 from unmix_plugin.limits import parse_xml, read_bounded
 

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from unmix_plugin.captures.band_entries import StatedBands, check_bands, state_bands
 from unmix_plugin.captures.camera_tags import camera_tags, with_camera_tags
 from unmix_plugin.captures.cube import (
     Cube,
@@ -29,7 +30,7 @@ from unmix_plugin.captures.cube import (
     import_extra,
     with_mask,
 )
-from unmix_plugin.captures.fields import StatedBands, check_bands, state_bands, state_exposure
+from unmix_plugin.captures.fields import state_exposure
 from unmix_plugin.captures.numbers import Axes, Block, Decoded, Mapped, Numbers
 from unmix_plugin.captures.readers.arrays import choose_axes, image_shape
 from unmix_plugin.captures.readers.gdal import gdal_entries, gdal_items, gdal_linear, gdal_number
