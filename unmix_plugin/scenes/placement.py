@@ -9,8 +9,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import Any, TypeAlias
 
+import msgspec
 import numpy as np
 from jaxtyping import Float, Float64
 
@@ -43,6 +44,18 @@ class _Similarity:
 
     def _undo(self, points: Float[np.ndarray, "*points 3"]) -> Float64[np.ndarray, "*points 3"]:
         return (points / self.scale - self.translation) @ self.rotation + self.offset
+
+
+_Triple: TypeAlias = tuple[float, float, float]
+
+
+class _WrittenSimilarity(msgspec.Struct):
+    """What `Normalisation.to_json` writes."""
+
+    rotation: tuple[_Triple, _Triple, _Triple]
+    translation: _Triple
+    scale: float
+    offset: _Triple = (0.0, 0.0, 0.0)
 
 
 class Placement(_Similarity):
@@ -106,13 +119,11 @@ class Normalisation(_Similarity):
         }
 
     @staticmethod
-    def from_json(values: dict[str, Any]) -> Normalisation:
-        """The transform that `to_json` wrote."""
+    def from_json(values: Any) -> Normalisation:
+        """The transform that `to_json` wrote. Raises ValueError: a part is missing or of another shape."""
+        found = msgspec.convert(values, _WrittenSimilarity)
         return Normalisation(
-            np.array(values["rotation"], dtype=np.float64).reshape(3, 3),
-            np.array(values["translation"], dtype=np.float64).reshape(3),
-            float(values["scale"]),
-            np.array(values.get("offset", (0.0, 0.0, 0.0)), dtype=np.float64).reshape(3),
+            np.array(found.rotation), np.array(found.translation), found.scale, np.array(found.offset)
         )
 
 

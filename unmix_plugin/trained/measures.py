@@ -11,10 +11,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
 from jaxtyping import Float64
+from msgspec import Meta
 
 from unmix_plugin.engine.runs.run_folder import RunFolder, RunLock
 from unmix_plugin.engine.runs.run_json import read_run_json, write_run_json
@@ -22,10 +24,17 @@ from unmix_plugin.errors import ConfigError, RunError, did_you_mean
 from unmix_plugin.scenes.folder import METRES_KEY, METRES_RANGE
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION
 from unmix_plugin.trained.protocol import RenderableScene
-from unmix_plugin.trained.regions import MOST_REGIONS, Region, check_name, region_from_json, region_to_json
+from unmix_plugin.trained.regions import (
+    MOST_REGIONS,
+    Region,
+    WrittenRegion,
+    check_name,
+    read_region,
+    region_to_json,
+)
 
 _LONGEST_TEXT = 200
-_DAMAGE = (AttributeError, LookupError, TypeError, ValueError, RuntimeError, OverflowError, ConfigError)
+_DAMAGE = (ValueError, RuntimeError, OverflowError, ConfigError)
 """What reading a file that holds something else raises."""
 _LONGEST_CHANGE_S = 20.0
 _CENTIMETRES_FROM_M, _METRES_FROM_M = 0.01, 1.0
@@ -103,13 +112,23 @@ def describe_area(square_units: float, scale: Scale | None) -> str:
     return f"{square_metres:.4g} m²" if square_metres >= 1.0 else f"{1e4 * square_metres:.4g} cm²"
 
 
+class _WrittenScale(msgspec.Struct):
+    metres_per_unit: float
+    how: Annotated[str, Meta(max_length=_LONGEST_TEXT)]
+
+
+class _WrittenMeasures(msgspec.Struct):
+    """What `measures.json` holds."""
+
+    scale: _WrittenScale | None = None
+    regions: Annotated[dict[str, WrittenRegion], Meta(max_length=MOST_REGIONS)] = {}
+
+
 def recorded_scale(summary: Mapping[str, Any]) -> Scale | None:
     """What the scene of a run said of its world's units; None where it did not, a RunError where that is damaged."""
     try:
-        stated = {"metres_per_unit": summary[METRES_KEY], "how": "as the scene's poses say"}
-        return None if stated["metres_per_unit"] is None else _scale_from_json(stated)
-    except KeyError:
-        return None
+        metres = msgspec.convert(summary.get(METRES_KEY), float | None)
+        return None if metres is None else Scale(metres, "as the scene's poses say")
     except (ConfigError, ValueError) as error:
         raise RunError(f"the run's scene.json is damaged: {error}") from error
 
@@ -121,12 +140,13 @@ def read_measures(run: RunFolder) -> Measures:
         return Measures()
     values = read_run_json(path)
     try:
-        scale, regions = values.get("scale"), values.get("regions", {})
-        if len(regions) > MOST_REGIONS:
-            raise ValueError(f"{len(regions)} regions, more than {MOST_REGIONS}")
+        written = msgspec.convert(values, _WrittenMeasures)
+        scale, regions = None, written.regions
+        if written.scale is not None:
+            how = "".join(letter for letter in written.scale.how if letter.isprintable())
+            scale = Scale(written.scale.metres_per_unit, how)
         return Measures(
-            None if scale is None else _scale_from_json(scale),
-            {check_name(name, regions): region_from_json(region) for name, region in regions.items()},
+            scale, {check_name(name, regions): read_region(region) for name, region in regions.items()}
         )
     except _DAMAGE as error:
         raise RunError(f"{path} is damaged: {error}; remove it, and measure again") from error
@@ -225,13 +245,6 @@ def require_on_surface(scene: RenderableScene, point: Sequence[float]) -> None:
 
 def _text(point: Float64[np.ndarray, "3"]) -> str:
     return " ".join(f"{value:.6g}" for value in point)
-
-
-def _scale_from_json(values: Any) -> Scale:
-    metres, how = values["metres_per_unit"], values["how"]
-    if type(metres) not in (int, float) or not isinstance(how, str) or len(how) > _LONGEST_TEXT:
-        raise ValueError(f"its scale is {str(values)[:80]}")
-    return Scale(float(metres), "".join(letter for letter in how if letter.isprintable()))
 
 
 def measures_path(run: RunFolder) -> Path:

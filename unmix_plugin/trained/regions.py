@@ -8,10 +8,12 @@ from __future__ import annotations
 import unicodedata
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
+import msgspec
 import numpy as np
 from jaxtyping import Bool
+from msgspec import Meta
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.errors import ConfigError
@@ -109,7 +111,7 @@ def polygon_mask(corners: Sequence[tuple[float, float]], size: tuple[int, int]) 
 
 
 def region_to_json(region: Region) -> dict[str, Any]:
-    """Numbers and lists; `region_from_json` restores the same region."""
+    """Numbers and lists; `read_region` restores the same region."""
     if isinstance(region, Box):
         return {"kind": "box", "low": list(region.low), "high": list(region.high)}
     if isinstance(region, OfMaterial):
@@ -117,24 +119,35 @@ def region_to_json(region: Region) -> dict[str, Any]:
     return {"kind": "view", "camera": region.camera.to_json(), "runs": list(region.runs)}
 
 
-def region_from_json(values: Any) -> Region:
-    """The region that `region_to_json` wrote; where it is none, the errors are of many kinds."""
-    kind = values["kind"]
-    if kind == "box":
-        low, high = ([float(number) for number in values[key]] for key in ("low", "high"))
-        if len(low) != 3 or len(high) != 3:
-            raise ValueError("a box that has not 3 numbers a corner")
-        return Box((low[0], low[1], low[2]), (high[0], high[1], high[2]))
-    if kind == "material":
-        if type(values["material"]) is not int or values["material"] < 0:
-            raise ValueError(f"material {str(values['material'])[:40]}")
-        return OfMaterial(values["material"])
-    if kind != "view":
-        raise ValueError(f"a region of the kind {str(kind)[:40]!r}")
-    camera, runs = Cameras.from_json(values["camera"]), values["runs"]
+class _WrittenBox(msgspec.Struct, tag="box", tag_field="kind"):
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+
+
+class _WrittenMaterial(msgspec.Struct, tag="material", tag_field="kind"):
+    material: Annotated[int, Meta(ge=0)]
+
+
+class _WrittenView(msgspec.Struct, tag="view", tag_field="kind"):
+    camera: dict[str, Any]
+    runs: list[Annotated[int, Meta(ge=0)]]
+
+
+WrittenRegion: TypeAlias = _WrittenBox | _WrittenMaterial | _WrittenView
+"""What `region_to_json` writes."""
+
+
+def read_region(written: WrittenRegion) -> Region:
+    """The region that `region_to_json` wrote. Raises ConfigError: a box without a volume. Raises ValueError,
+    RuntimeError: a camera that is none, or pixels that are not those of its view."""
+    if isinstance(written, _WrittenBox):
+        return Box(written.low, written.high)
+    if isinstance(written, _WrittenMaterial):
+        return OfMaterial(written.material)
+    camera, runs = Cameras.from_json(written.camera), written.runs
     pixels = camera.width * camera.height
-    if len(camera) != 1 or pixels > _MOST_PIXELS or not all(type(run) is int and run >= 0 for run in runs):
-        raise ValueError("a view without one camera and runs of pixels")
+    if len(camera) != 1 or pixels > _MOST_PIXELS:
+        raise ValueError(f"a view of {len(camera)} cameras with {pixels} pixels")
     if sum(runs) != pixels:
         raise ValueError(f"runs of {sum(runs)} pixels in a view of {pixels}")
     return InView(camera, runs)

@@ -135,7 +135,7 @@ def world_frame(scene: SceneRecord) -> Normalisation:
         return Normalisation(np.eye(3), np.zeros(3), 1.0)
     try:
         return Normalisation.from_json(recorded)
-    except (KeyError, TypeError, ValueError) as error:
+    except ValueError as error:
         raise RunError(
             f"the run's scene.json is damaged: its normalisation is {recorded!r} ({error}); train again"
         ) from error

@@ -21,17 +21,39 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Annotated, Any, TypeAlias
 
+import msgspec
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from msgspec import Meta
 from torch import Tensor
 
-from unmix_plugin.engine.geometry.key_poses import KeyPoses, are_rigid, project_by_row
+from unmix_plugin.engine.geometry.key_poses import (
+    KeyPoses,
+    WrittenKeyPoses,
+    WrittenPose,
+    are_rigid,
+    project_by_row,
+)
 from unmix_plugin.engine.geometry.space import RayBundle
 
-_LONGEST_EDGE_PX = 1 << 16
+_Edge: TypeAlias = Annotated[int, Meta(ge=1, le=1 << 16)]
+"""Of an image in files, pixels."""
+
+
+class _WrittenCameras(msgspec.Struct):
+    """What `Cameras.to_json` writes."""
+
+    width: _Edge
+    height: _Edge
+    camera_to_world: list[WrittenPose]
+    focal_px: list[tuple[float, float]]
+    center_px: list[tuple[float, float]]
+    distortion: list[Annotated[list[float], Meta(min_length=4, max_length=6)]]
+    sizes: list[tuple[_Edge, _Edge]] = []
+    key_poses: WrittenKeyPoses | None = None
 
 
 @dataclass(frozen=True)
@@ -230,27 +252,22 @@ class Cameras:
         }
 
     @staticmethod
-    def from_json(values: dict[str, Any]) -> Cameras:
-        """The cameras that `to_json` wrote. Raises KeyError, TypeError, ValueError, RuntimeError: a part is missing, of
-        another shape or out of its range."""
-        count, width, height = len(values["camera_to_world"]), values["width"], values["height"]
-        sizes = [tuple(size) for size in values.get("sizes", [])]
-        for size in ((width, height), *sizes):
-            are_edges = all(type(edge) is int and 1 <= edge <= _LONGEST_EDGE_PX for edge in size)
-            if len(size) != 2 or not are_edges:
-                shown = " x ".join(map(str, size))
-                raise ValueError(f"an image of {shown} pixels; edges have 1 to {_LONGEST_EDGE_PX}")
+    def from_json(values: Any) -> Cameras:
+        """The cameras that `to_json` wrote. Raises ValueError, RuntimeError: a part is missing, of another shape or out
+        of its range."""
+        written = msgspec.convert(values, _WrittenCameras)
+        count, sizes, keys = len(written.camera_to_world), written.sizes, written.key_poses
         if sizes and len(sizes) != count:
             raise ValueError(f"{len(sizes)} image sizes for {count} cameras")
         cameras = Cameras(
-            torch.tensor(values["camera_to_world"], dtype=torch.float32).reshape(count, 3, 4),
-            torch.tensor(values["focal_px"], dtype=torch.float32).reshape(count, 2),
-            torch.tensor(values["center_px"], dtype=torch.float32).reshape(count, 2),
-            torch.tensor(values["distortion"], dtype=torch.float32).reshape(count, -1 if count else 4),
-            width,
-            height,
+            torch.tensor(written.camera_to_world, dtype=torch.float32).reshape(count, 3, 4),
+            torch.tensor(written.focal_px, dtype=torch.float32).reshape(count, 2),
+            torch.tensor(written.center_px, dtype=torch.float32).reshape(count, 2),
+            torch.tensor(written.distortion, dtype=torch.float32).reshape(count, -1 if count else 4),
+            written.width,
+            written.height,
             tuple(sizes) or None,
-            KeyPoses.from_json(values["key_poses"], count) if "key_poses" in values else None,
+            None if keys is None else KeyPoses.read(keys, count),
         )
         if cameras.distortion.shape[1] not in (4, 6):
             raise ValueError(f"{cameras.distortion.shape[1]} coefficients of distortion; expected 4 or 6")

@@ -15,11 +15,25 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Annotated, Any, TypeAlias
 
+import msgspec
 import torch
 from jaxtyping import Bool, Float, Float64, Int
+from msgspec import Meta
 from torch import Tensor
+
+_Row: TypeAlias = tuple[float, float, float, float]
+WrittenPose: TypeAlias = tuple[_Row, _Row, _Row]
+"""A pose in files, row by row."""
+
+
+class WrittenKeyPoses(msgspec.Struct):
+    """What `KeyPoses.to_json` writes."""
+
+    counts: list[Annotated[int, Meta(ge=1)]]
+    heights: list[float]
+    poses: list[WrittenPose]
 
 
 @dataclass(frozen=True)
@@ -98,7 +112,7 @@ class KeyPoses:
         return turns.to(self.poses)
 
     def to_json(self) -> dict[str, Any]:
-        """Lists of numbers; `from_json` restores the same bits."""
+        """Lists of numbers; `read` restores the same bits."""
         return {
             "counts": list(self.counts),
             "heights": self.heights.tolist(),
@@ -106,16 +120,17 @@ class KeyPoses:
         }
 
     @staticmethod
-    def from_json(values: dict[str, Any], num_cameras: int) -> KeyPoses:
-        """The key poses that `to_json` wrote. Raises KeyError, TypeError, ValueError, RuntimeError: a part is missing,
-        of another shape or out of its range."""
-        counts = tuple(values["counts"])
-        if len(counts) != num_cameras or not all(type(count) is int and count >= 1 for count in counts):
-            raise ValueError(f"key poses need a count of at least 1 for each of {num_cameras} cameras")
-        total = sum(counts)
-        heights = torch.tensor(values["heights"], dtype=torch.float32).reshape(total)
-        poses = torch.tensor(values["poses"], dtype=torch.float32).reshape(total, 3, 4)
-        found = KeyPoses(poses, heights, counts)
+    def read(written: WrittenKeyPoses, num_cameras: int) -> KeyPoses:
+        """The key poses that `to_json` wrote. Raises ValueError, RuntimeError: parts that don't fit each other, or
+        numbers out of their range."""
+        counts, total = written.counts, sum(written.counts)
+        if len(counts) != num_cameras or not len(written.heights) == len(written.poses) == total:
+            raise ValueError(
+                f"key poses need counts for each of {num_cameras} cameras, and as many heights and poses as these say"
+            )
+        heights = torch.tensor(written.heights, dtype=torch.float32).reshape(total)
+        poses = torch.tensor(written.poses, dtype=torch.float32).reshape(total, 3, 4)
+        found = KeyPoses(poses, heights, tuple(counts))
         if not (are_rigid(poses) and heights.isfinite().all()):
             raise ValueError("key poses must be rotations and finite positions")
         if not (found._places.diff() > 0).all():
