@@ -8,7 +8,7 @@ import pytest
 
 from tests.factories.files import file_of, present, write_band_file, xmp_packet
 from unmix_plugin.captures.camera_tags import (
-    _RadiometricModel,
+    RadiometricModel,
     band_of,
     parse_xmp,
     radiometric_model,
@@ -126,7 +126,7 @@ def radiance_of(file: Cube, rows: slice = slice(None)) -> np.ndarray:
     return model_of(file).apply(file.read(rows).astype(np.float64), rows)
 
 
-def model_of(file: Cube) -> _RadiometricModel:
+def model_of(file: Cube) -> RadiometricModel:
     return present(radiometric_model(file))
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-import tempfile
+import subprocess
+import sys
 from collections import Counter
 
 import h5py
@@ -140,10 +141,16 @@ def test_what_a_full_disk_had_no_place_for_is_decoded_again(tmp_path, monkeypatc
 
 
 @pytest.mark.skipif(os.name == "nt", reason="a file without a name is one that is unlinked")
-def test_the_scratch_file_has_no_name_that_could_stay(tmp_path, monkeypatch):
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "scratch"))
-    (tmp_path / "scratch").mkdir()
-    monkeypatch.setattr(numbers, "_scratch", numbers._Scratch())
-    np.testing.assert_array_equal(open_spectral_file(write_tiff(tmp_path / "a.tif", CUBE)).read(), CUBE)
-    assert list((tmp_path / "scratch").iterdir()) == []
-    numbers._scratch.close()
+def test_the_scratch_file_has_no_name_that_could_stay(tmp_path):
+    path, scratch = write_tiff(tmp_path / "a.tif", CUBE), tmp_path / "scratch"
+    scratch.mkdir()
+    code = (
+        "import sys; from pathlib import Path\n"
+        "from unmix_plugin.captures.readers.opening import open_spectral_file\n"
+        "values = open_spectral_file(Path(sys.argv[1])).read()\n"
+        "print(values.sum(), len(list(Path(sys.argv[2]).iterdir())))"
+    )
+    words = [sys.executable, "-c", code, str(path), str(scratch)]
+    environment = {**os.environ, "TMPDIR": str(scratch)}
+    done = subprocess.run(words, env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == [str(CUBE.sum()), "0"]

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from unmix_plugin.scenes.demo import scene as demo_scene
-from unmix_plugin.scenes.demo.shading import _LAMP_POSITION, THINGS, render_view
+from unmix_plugin.scenes.demo.shading import LAMP_POSITION, THINGS, render_view
 
 PLACEMENTS = tuple(thing.placement for thing in THINGS)
 TABLE, APPLE, *_ = THINGS
-LAMP = np.array(_LAMP_POSITION, dtype=np.float32)
+LAMP = np.array(LAMP_POSITION, dtype=np.float32)
 
 
 def row(*values):

@@ -65,9 +65,10 @@ def test_chunks_are_read_whole_and_once_a_turn_as_they_come_into_the_pool():
 
 @pytest.mark.parametrize("num_bytes", [4000, 8800])
 def test_all_that_a_pool_holds_fits_into_its_memory(num_bytes):
-    pool = make_pool(num_bytes=num_bytes)
+    valid = torch.ones(PIXELS, dtype=torch.bool)
+    pool = make_pool(valid, num_bytes)
     draw(pool, 0)
-    held = [x for x in vars(pool).values() if isinstance(x, torch.Tensor) and x is not pool._valid]
+    held = [x for x in vars(pool).values() if isinstance(x, torch.Tensor) and x is not valid]
     assert num_bytes - 800 < sum(value.numel() * value.element_size() for value in held) <= num_bytes
 
 

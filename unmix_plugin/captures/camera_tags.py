@@ -218,7 +218,7 @@ class _RowGain:
 
 
 @dataclass(frozen=True)
-class _RadiometricModel:
+class RadiometricModel:
     """How the stored numbers of one file become radiance."""
 
     maker: str
@@ -258,7 +258,7 @@ class _RadiometricModel:
         return ((values - self.black_level) * factor[..., None]).astype(np.float32)
 
 
-def radiometric_model(file: Cube) -> _RadiometricModel | None:
+def radiometric_model(file: Cube) -> RadiometricModel | None:
     """The calibration that a file carries in its camera's tags; None where there is none. Raises
     CaptureError: the file has a calibration that lacks a number, or one that can't be."""
     tags, exif = file.camera.xmp, file.camera.exif
@@ -275,7 +275,7 @@ def radiometric_model(file: Cube) -> _RadiometricModel | None:
     return model
 
 
-def _micasense(file: Cube, tags: XmpTags, exif: Mapping[str, Any]) -> _RadiometricModel:
+def _micasense(file: Cube, tags: XmpTags, exif: Mapping[str, Any]) -> RadiometricModel:
     """MicaSense RedEdge and Altum: radiance in W/m2/sr/nm.
 
         L = 1 / V * a1 / (gain * exposure) * (p - pBL) / 2^bits / (1 + a2 y / exposure - a3 y)
@@ -303,7 +303,7 @@ def _micasense(file: Cube, tags: XmpTags, exif: Mapping[str, Any]) -> _Radiometr
     to_si = tag_numbers(tags, "IrradianceScaleToSIUnits")
     default = [0.01 if tag_numbers(tags, "HorizontalIrradiance") else 1.0]
     measured = None if irradiance is None else irradiance[0] * (to_si or default)[0]
-    return _RadiometricModel(
+    return RadiometricModel(
         maker="MicaSense",
         unit="W/m2/sr/nm",
         black_level=float(np.mean(levels)),
@@ -316,7 +316,7 @@ def _micasense(file: Cube, tags: XmpTags, exif: Mapping[str, Any]) -> _Radiometr
     )
 
 
-def _sequoia(file: Cube, tags: XmpTags, exif: Mapping[str, Any]) -> _RadiometricModel:
+def _sequoia(file: Cube, tags: XmpTags, exif: Mapping[str, Any]) -> RadiometricModel:
     """Parrot Sequoia: radiance in a unit of its own, the same for its four bands.
 
         I = f^2 (p - B) / (A * exposure * iso + C) / V(x / W, y / H)
@@ -332,7 +332,7 @@ def _sequoia(file: Cube, tags: XmpTags, exif: Mapping[str, Any]) -> _Radiometric
     saturated = _SATURATED_10_BITS if _stored_range(exif) == 2.0**10 else _SATURATED_10_BITS_OF_16
     # A black level that no number of 10 bits reaches is of the 16 bits that cameras fill otherwise.
     unit = 2.0**6 if saturated == _SATURATED_10_BITS < b else 1.0
-    return _RadiometricModel(
+    return RadiometricModel(
         maker="Parrot Sequoia",
         unit="relative",
         black_level=b / unit,
@@ -362,7 +362,7 @@ def _vignetting_2d(file: Cube, tags: XmpTags) -> _PlaneVignetting:
     return _PlaneVignetting(coefficients, height, width)
 
 
-def _dji(file: Cube, tags: XmpTags, exif: Mapping[str, Any]) -> _RadiometricModel:
+def _dji(file: Cube, tags: XmpTags, exif: Mapping[str, Any]) -> RadiometricModel:
     """DJI P4 Multispectral and Mavic 3 Multispectral: radiance in a unit of its own, the same for all bands.
 
         L = V(r) * (p - black level) / 2^bits / (gain * exposure) * gain adjustment
@@ -384,7 +384,7 @@ def _dji(file: Cube, tags: XmpTags, exif: Mapping[str, Any]) -> _RadiometricMode
     scale = adjustment[0] / (gain * 1e-6 * microseconds) / _stored_range(exif)
 
     irradiance = tag_numbers(tags, "drone-dji:Irradiance")
-    return _RadiometricModel(
+    return RadiometricModel(
         maker="DJI",
         unit="relative",
         black_level=float(np.mean(levels)),

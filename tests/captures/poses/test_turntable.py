@@ -9,10 +9,9 @@ from scipy.ndimage import binary_dilation
 
 from tests.factories.poses import align_poses
 from tests.factories.scenes import look_at
-from unmix_plugin.captures.poses import turntable as turntable_module
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet
-from unmix_plugin.captures.poses.turntable import poses_from_turntable
+from unmix_plugin.captures.poses.turntable import poses_from_observations, poses_from_turntable
 from unmix_plugin.captures.poses.turntable_observations import Turn, gather, parse_angles
 from unmix_plugin.errors import CaptureError, ConfigError
 
@@ -147,5 +146,5 @@ def test_matches_by_chance_do_not_move_the_cameras():
     pairs = generator.integers(0, COUNT - 1, 600)
     points = generator.uniform(70, 130, (600, 2, 2))
     disturbed = replace(evidence, first=pairs, second=pairs + 1, points=points)
-    found = turntable_module._pose_set(turntable_module._fit(disturbed), disturbed, names)
+    found = poses_from_observations(disturbed, names)
     assert align_poses(found, truth).rms_px < 0.5

@@ -9,7 +9,7 @@ from PIL import Image
 from tests.factories.demo_parts import LAMP, PLACEMENTS, one_ray_a_pixel
 from unmix_plugin.errors import ConfigError, SceneError, SpectrumError
 from unmix_plugin.scenes.demo import scene as demo_scene
-from unmix_plugin.scenes.demo.shading import MATERIALS, _trace, band_centers_nm, lamp_power, reflectances
+from unmix_plugin.scenes.demo.shading import MATERIALS, band_centers_nm, lamp_power, reflectances, trace
 from unmix_plugin.scenes.demo.shapes import first_hits
 from unmix_plugin.spectral.library.spectra_csv import read_spectra
 
@@ -46,12 +46,12 @@ def test_what_a_highlight_adds_to_the_same_point_has_the_lamps_colour():
     spectra, lamp = spectra_of(31)
     rays = demo_scene.demo_cameras(64, 8).image_rays(2)
     origins, directions = rays.origins.numpy(), rays.directions.numpy()
-    brightest = _trace(origins, directions, LAMP[None]).specular.argmax()
+    brightest = trace(origins, directions, LAMP[None]).specular.argmax()
     distances, _ = first_hits(PLACEMENTS, origins, directions)
     point = origins[brightest] + distances[brightest] * directions[brightest]
     eyes = np.stack([origins[brightest], point + 2 * np.array([0, 0.3, 1], dtype=np.float32)])
     towards = (point - eyes) / np.linalg.norm(point - eyes, axis=1, keepdims=True)
-    seen = _trace(eyes, towards.astype(np.float32), LAMP[None])
+    seen = trace(eyes, towards.astype(np.float32), LAMP[None])
     assert seen.specular[0] > 0.5
     assert seen.specular[1] < 0.1
     radiances = (seen.diffuse @ spectra + seen.specular[:, None]) * lamp

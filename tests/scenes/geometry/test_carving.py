@@ -17,7 +17,7 @@ from unmix_plugin.scenes.doctor import check_masks
 from unmix_plugin.scenes.evidence import AlphaEvidence
 from unmix_plugin.scenes.geometry import carving
 from unmix_plugin.scenes.geometry.bounds import find_bounds
-from unmix_plugin.scenes.geometry.carving import _needed_witnesses, carve_box, foreground_rays
+from unmix_plugin.scenes.geometry.carving import carve, carve_box
 from unmix_plugin.scenes.messages import Message
 from unmix_plugin.scenes.pixel_table import PixelTable
 from unmix_plugin.scenes.reading.loader import load_scene
@@ -180,27 +180,35 @@ def test_views_of_two_sizes_carve_and_bound_the_same_ball():
     assert np.abs(box).max() < 1.4  # pixels of the smaller views are wide
 
 
-def test_a_hole_in_one_mask_does_not_carve_what_all_other_views_see():
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory) -> Scene:
+    folder = tmp_path_factory.mktemp("demo") / "scene"
+    make_demo_scene(folder, size=64, bands=4, views=16)
+    return load_scene(folder)
+
+
+def boxed(scene: Scene) -> Scene:
+    """A scene in a box, for other cameras and masks."""
+    return replace(scene, scene_box=BOX, is_unbounded=False)
+
+
+def test_a_hole_in_one_mask_does_not_carve_what_all_other_views_see(demo):
     poses = ring_poses(12)
     cameras, foreground = make_cameras(poses), ball_matter(poses, 0.5)
     true = carve_box(cameras, foreground, BOX, 32)
+    assert carve(boxed(demo), 32, foreground, cameras).sum() <= true.sum()
     foreground[3] = foreground[3].copy()
     foreground[3][14:26, 14:26] = False
-    rays = foreground_rays(cameras, foreground)
-    assert _needed_witnesses(cameras, ball_matter(poses, 0.5), BOX, rays) == 1
-    witnesses = _needed_witnesses(cameras, foreground, BOX, rays)
-    assert witnesses == 2
-    spoilt, kept = (carve_box(cameras, foreground, BOX, 32, witnesses=count) for count in (1, witnesses))
+    spoilt, kept = carve_box(cameras, foreground, BOX, 32), carve(boxed(demo), 32, foreground, cameras)
     assert (true & ~spoilt).sum() > 0.1 * true.sum()
     assert not (true & ~kept).any()
     assert kept.sum() < 1.6 * true.sum()
 
 
-def test_where_many_views_look_through_what_the_others_see_more_must_agree():
+def test_where_many_views_look_through_what_the_others_see_more_must_agree(demo):
     """Leaves move between views; but no more than 0.3 of the views are asked to agree, if that is more than three."""
     poses = ring_poses(24)
     cameras, true = make_cameras(poses), ball_matter(poses, 0.5)
-    rays = foreground_rays(cameras, true)
 
     def spoilt(num_views: int) -> list[np.ndarray]:
         masks = [mask.copy() for mask in true]
@@ -208,19 +216,12 @@ def test_where_many_views_look_through_what_the_others_see_more_must_agree():
             mask[14:26, 14:26] = False
         return masks
 
-    witnesses = _needed_witnesses(cameras, spoilt(5), BOX, rays)
-    assert witnesses == 4
-    few, enough = (carve_box(cameras, spoilt(5), BOX, 64, witnesses=count) for count in (3, witnesses))
-    shares = [carving.share_through(rays, BOX, hull) for hull in (few, enough)]
+    scene, few = boxed(demo), carve_box(cameras, spoilt(5), BOX, 64, witnesses=2)
+    enough = carve(scene, 64, spoilt(5), cameras)
+    shares = [carving.share_explained(scene, hull, spoilt(5), cameras) for hull in (few, enough)]
     assert shares[0] < carving.MIN_EXPLAINED <= shares[1]
-    assert _needed_witnesses(cameras, spoilt(20), BOX, rays) == 6
-
-
-@pytest.fixture(scope="module")
-def demo(tmp_path_factory) -> Scene:
-    folder = tmp_path_factory.mktemp("demo") / "scene"
-    make_demo_scene(folder, size=64, bands=4, views=16)
-    return load_scene(folder)
+    most = carve_box(cameras, spoilt(20), BOX, 64, witnesses=6)
+    assert (carve(scene, 64, spoilt(20), cameras) <= most).all()
 
 
 def turned(scene: Scene, size: float) -> Scene:

@@ -5,7 +5,7 @@ import torch
 from tests.factories.ball_views import ABOVE, BOX, RADIUS, SIDE, ball_matter, ball_views, make_cameras
 from tests.factories.scenes import ring_poses
 from unmix_plugin.scenes.geometry.carving import carve_box
-from unmix_plugin.scenes.geometry.lighting import _view_gains, judge_light
+from unmix_plugin.scenes.geometry.lighting import judge_light, view_gains
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.5])
@@ -25,10 +25,10 @@ def test_gains_are_found_exactly_where_places_differ_by_nothing_else():
     log_gains = torch.from_numpy(generator.normal(size=8) * 0.2).float()
     seen = torch.from_numpy(generator.normal(size=(100, 1))).float() + log_gains
     seen[torch.from_numpy(generator.random((100, 8)) < 0.6)] = torch.nan
-    found = _view_gains(seen)
+    found = view_gains(seen)
     torch.testing.assert_close(found, log_gains - log_gains.mean(), atol=1e-4, rtol=0)
     seen[:, 3] = torch.nan
-    assert _view_gains(seen).isnan().tolist() == [index == 3 for index in range(8)]
+    assert view_gains(seen).isnan().tolist() == [index == 3 for index in range(8)]
 
 
 def test_too_few_views_or_dark_ones_say_nothing():

@@ -11,7 +11,7 @@ from unmix_plugin.scenes.demo.scene import PLACES, make_demo_scene
 from unmix_plugin.scenes.demo.shapes import first_hits
 from unmix_plugin.scenes.geometry import surface_evidence
 from unmix_plugin.scenes.geometry.carving import carve
-from unmix_plugin.scenes.geometry.surface_evidence import SurfaceEvidence, _sweep_depths
+from unmix_plugin.scenes.geometry.surface_evidence import SurfaceEvidence, sweep_depths
 from unmix_plugin.scenes.geometry.views import Views
 from unmix_plugin.scenes.pixel_table import PixelTable
 from unmix_plugin.scenes.reading.loader import load_scene
@@ -92,7 +92,7 @@ def test_views_of_differing_exposure_and_large_noisy_views_are_swept_too(scene, 
         return (gains[view] * cube + noise)[part]
 
     views = Views(cameras.resized(edge * cameras.width, edge * cameras.height), read)
-    depths = present(_sweep_depths(views, scene.scene_box))
+    depths = present(sweep_depths(views, scene.scene_box))
     assert depths.stride == 2 * (1 if edge == 1 else 3)
     share, right = share_right(scene, views.cameras, [0, 5, 10], depths)
     assert share > 0.3
@@ -107,7 +107,7 @@ def test_the_distances_of_what_masks_leave_out_stay_unknown(scene):
 
     def swept(read_valid):
         views = Views(cameras, lambda view, part: scene.cube(train[view], part), read_valid)
-        depths = present(_sweep_depths(views, scene.scene_box))
+        depths = present(sweep_depths(views, scene.scene_box))
         return depths.distances
 
     found, everything = swept(lambda _: valid), swept(None)
@@ -148,9 +148,9 @@ def test_nothing_is_known_of_views_that_show_one_colour_or_are_too_few():
     def noisy(view, part):
         return np.random.default_rng(view).random(size, np.float32)[part]
 
-    assert _sweep_depths(Views(cameras, plain), BOX) is None
-    assert _sweep_depths(Views(cameras[[0, 1, 2]], noisy), BOX) is None
-    unrelated = present(_sweep_depths(Views(cameras, noisy), BOX))
+    assert sweep_depths(Views(cameras, plain), BOX) is None
+    assert sweep_depths(Views(cameras[[0, 1, 2]], noisy), BOX) is None
+    unrelated = present(sweep_depths(Views(cameras, noisy), BOX))
     assert torch.isfinite(unrelated.distances).float().mean() < 0.05
 
 
@@ -158,7 +158,7 @@ def test_nothing_is_known_of_views_that_show_one_colour_or_are_too_few():
 def test_views_of_a_pixel_or_a_row_are_too_small_to_be_swept(scene, size):
     small = scene.cameras[list(scene.train_indices)].resized(size[1], size[0])
     pixels = np.random.default_rng(0).random((*size, 3), np.float32)
-    assert _sweep_depths(Views(small, lambda view, part: (pixels + 0.01 * view)[part]), BOX) is None
+    assert sweep_depths(Views(small, lambda view, part: (pixels + 0.01 * view)[part]), BOX) is None
 
 
 @pytest.mark.parametrize("num_views", [2, 3])
@@ -166,8 +166,8 @@ def test_three_views_must_look_through_a_cell(num_views):
     positions = [np.array([2.5, side, 0.3]) for side in (-0.4, 0.0, 0.4)]
     cameras = make_cameras([look_at(position, np.array([-20.0, 0.0, 0.0])) for position in positions])
     shape = (num_views, cameras.height, cameras.width)
-    depths = surface_evidence._SweptDepths(tuple(range(num_views)), torch.full(shape, 3.0), 1)
-    empty = surface_evidence._seen_through(depths, cameras, BOX, 32)
+    depths = surface_evidence.SweptDepths(tuple(range(num_views)), torch.full(shape, 3.0), 1)
+    empty = surface_evidence.seen_through(depths, cameras, BOX, 32)
     # Before the surface, on it, behind it, and behind the cameras.
     points = torch.tensor([[0.5, 0.0, 0.3], [-0.5, 0.0, 0.3], [-1.5, 0.0, 0.3], [4.0, 0.0, 0.3]])
     cells = (UnitSpace(BOX, is_unbounded=True).to_unit(points) * 32).long()

@@ -10,8 +10,8 @@ from tests.factories.scenes import look_at
 from unmix_plugin.engine.geometry.space import SceneBox, UnitSpace
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes.demo.scene import PLACES, make_demo_scene
-from unmix_plugin.scenes.geometry.carving import _carve_world
-from unmix_plugin.scenes.geometry.view_agreement import _WorldEvidence
+from unmix_plugin.scenes.geometry.carving import carve
+from unmix_plugin.scenes.geometry.view_agreement import WorldEvidence
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.settings import SceneOptions
 
@@ -41,9 +41,9 @@ def test_what_goes_on_behind_the_box_is_found_from_the_views(folders, name, is_u
 
 
 def test_a_world_goes_on_where_pixels_or_matched_places_tell_of_more_than_a_closed_box():
-    closed = _WorldEvidence(num_pixels=1000, num_inside=900, num_behind=20, num_explained=850)
+    closed = WorldEvidence(num_pixels=1000, num_inside=900, num_behind=20, num_explained=850)
     assert not closed.goes_on
-    assert not _WorldEvidence(0, 0, 0, 0).goes_on
+    assert not WorldEvidence(0, 0, 0, 0).goes_on
     assert replace(closed, num_inside=600, num_behind=300).goes_on
     assert replace(closed, num_inside=900, num_behind=80).goes_on  # walls that few views see, beyond the box
     assert replace(closed, num_inside=300, num_behind=10, num_explained=350).goes_on
@@ -60,21 +60,27 @@ def test_a_world_behind_what_is_transparent_is_refused(folders):
         load_scene(folders / "table", SceneOptions(world="unbounded"))
 
 
-def test_cells_that_one_view_alone_sees_are_carved_and_those_that_many_see_are_not():
+@pytest.fixture
+def world(folders):
+    """A scene whose world goes on behind the box, for other cameras."""
+    return replace(load_scene(folders / "world"), scene_box=BOX, is_unbounded=True)
+
+
+def test_cells_that_one_view_alone_sees_are_carved_and_those_that_many_see_are_not(world):
     """Two cameras side by side see the same far places, and each what is right before it alone."""
     positions = [np.array([3.0, side, 0.3]) for side in (-1.0, 1.0)]
     cameras = make_cameras([look_at(position, np.array([-20.0, 0.0, 0.0])) for position in positions])
-    kept = _carve_world(cameras, BOX, 32)
+    kept = carve(world, 32, cameras=cameras)
     points = torch.tensor([[0.0, 0.0, 0.0], [-30.0, 0.0, 0.0], [2.2, -1.0, 0.3], [8.0, 0.0, 0.0]])
     cells = (UnitSpace(BOX, is_unbounded=True).to_unit(points) * 32).long()
     assert kept[tuple(cells.T.numpy())].tolist() == [True, True, False, False]
 
 
 @pytest.mark.parametrize(("beside", "is_kept"), [(0, False), (1, False), (2, True)])
-def test_what_is_near_a_camera_must_be_seen_by_others_from_its_side(beside, is_kept):
+def test_what_is_near_a_camera_must_be_seen_by_others_from_its_side(world, beside, is_kept):
     """Views from the other side see the place too, but hold nothing that fits the nearest picture alone."""
     nearest = [np.array([3.0, 0.2 * index, 0.3]) for index in range(1 + beside)]
     opposite = [np.array([-3.0, side, 0.3]) for side in (-0.6, -0.2, 0.2, 0.6)]
     cameras = make_cameras([look_at(position, np.zeros(3)) for position in nearest + opposite])
     place = UnitSpace(BOX, is_unbounded=True).to_unit(torch.tensor([1.5, 0.02, 0.16]))
-    assert _carve_world(cameras, BOX, 32)[tuple((place * 32).long())] == is_kept
+    assert carve(world, 32, cameras=cameras)[tuple((place * 32).long())] == is_kept

@@ -86,6 +86,12 @@ def poses_from_turntable(
         [turns[name] for name in names],
         None if masks is None else [masks[name] for name in names],
     )
+    return poses_from_observations(observed, names)
+
+
+def poses_from_observations(observed: Observations, names: Sequence[str]) -> PoseSet:
+    """The poses that explain what the views of these names show. Raises CaptureError: the views are alike, or the
+    angles do not explain them."""
     _refuse_alike(observed, len(observed.first))
     fitted = _fit(observed)
     _refuse_unexplained(fitted, observed)

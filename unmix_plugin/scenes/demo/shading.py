@@ -118,14 +118,14 @@ def plain(points: Points) -> PerPoint:
     return np.zeros(len(points), dtype=points.dtype)
 
 
-_LAMP_POSITION = (2.6, -2.2, 4.2)
+LAMP_POSITION = (2.6, -2.2, 4.2)
 _LAMP_RADIUS = 0.55
-_LAMP_IRRADIANCE = 0.7
+LAMP_IRRADIANCE = 0.7
 """On a surface that faces the lamp; with the sky it keeps a white wall just below 1."""
 _SKY_IRRADIANCE = 0.34
 _BOUNCE_SHARE = 0.35
 """What a surface that faces down receives, as a share of the open sky."""
-_COAT_REFLECTANCE = 0.05
+COAT_REFLECTANCE = 0.05
 """Fresnel reflectance of the clear coats at normal incidence."""
 _SUBPIXELS = 3
 """Rays along each side of a pixel."""
@@ -199,7 +199,7 @@ def render_view(
     index: int,
     subpixels: int = _SUBPIXELS,
     things: Sequence[Thing] = THINGS,
-    lamp: _Place = _LAMP_POSITION,
+    lamp: _Place = LAMP_POSITION,
     sky: Sky | None = None,
 ) -> ViewCoefficients:
     """Look at things through one camera with `subpixels`^2 rays a pixel; `lamp` is the middle of its disc."""
@@ -217,7 +217,7 @@ def render_view(
             np.concatenate([getattr(one, name).numpy() for one in rays]) for name in ("origins", "directions")
         )
         lamps = np.stack([_lamp_point(i, count, lamp) for i in numbers]).repeat(pixels, axis=0)
-        hits = _trace(origins, directions, lamps, things, lamp)
+        hits = trace(origins, directions, lamps, things, lamp)
         if sky is not None:
             hits.diffuse[~hits.is_hit] = sky(directions[~hits.is_hit])
         seen = (hits.is_hit, hits.abundances, hits.diffuse, hits.specular)
@@ -232,12 +232,12 @@ def render_view(
     )
 
 
-def _trace(
+def trace(
     origins: Rays,
     directions: Rays,
     lamps: Float[np.ndarray, "#R 3"],
     things: Sequence[Thing] = THINGS,
-    lamp_middle: _Place = _LAMP_POSITION,
+    lamp_middle: _Place = LAMP_POSITION,
 ) -> _Hits:
     """What each ray sees first, lit by one point of the lamp and by the sky; highlights come from the lamp's middle.
     Directions have length 1."""
@@ -253,11 +253,11 @@ def _trace(
         points = origins[rows] + distances[rows, None] * directions[rows]
         local_points = thing.placement.to_local(points)
         normals = thing.placement.normals_at(local_points)
-        lamplight = _direct_light(points, normals, lamps[rows], placements)
+        lamplight = direct_light(points, normals, lamps[rows], placements)
         abundances[rows] = thing.surface.abundances(local_points)
         diffuse[rows] = abundances[rows] * (lamplight + _sky_light(points, normals, thing, things))[:, None]
         if thing.surface.roughness is not None:
-            highlight = _coat_highlight(
+            highlight = coat_highlight(
                 points, normals, -directions[rows], thing.surface.roughness, lamp_middle
             )
             specular[rows] = lamplight * highlight
@@ -277,7 +277,7 @@ def _lamp_point(i: int, count: int, middle: _Place) -> Float[np.ndarray, "3"]:
     return (np.array(middle) + offset).astype(np.float32)
 
 
-def _direct_light(
+def direct_light(
     points: Points, normals: Points, lamps: Float[np.ndarray, "#P 3"], placements: Sequence[PlacedPrimitive]
 ) -> PerPoint:
     """Irradiance of each point from one of the lamp's: 0 in the shadow of `placements`, no fall-off with distance."""
@@ -285,7 +285,7 @@ def _direct_light(
     cosines = (dot(towards_lamp, normals) / np.sqrt(dot(towards_lamp, towards_lamp))).clip(0)
     # The segment to the lamp has length 1: a ceiling lies farther away.
     blocked, _ = first_hits(placements, points + 1e-3 * normals, towards_lamp)
-    return np.where(blocked < 1, 0, _LAMP_IRRADIANCE * cosines).astype(np.float32)
+    return np.where(blocked < 1, 0, LAMP_IRRADIANCE * cosines).astype(np.float32)
 
 
 def _sky_light(points: Points, normals: Points, thing: Thing, things: Sequence[Thing]) -> PerPoint:
@@ -310,7 +310,7 @@ def _sky_light(points: Points, normals: Points, thing: Thing, things: Sequence[T
     return _SKY_IRRADIANCE * (_BOUNCE_SHARE + (1 - _BOUNCE_SHARE) * facing_up) * open_share
 
 
-def _coat_highlight(
+def coat_highlight(
     points: Points, normals: Points, towards_eye: Points, roughness: float, lamp_middle: _Place
 ) -> PerPoint:
     """Mirrored radiance for irradiance 1 from the lamp's centre, in units of a white matt surface's.
@@ -332,7 +332,7 @@ def _coat_highlight(
     shadowing = 1.0
     for cosine in (cos_eye, cos_lamp):
         shadowing = shadowing / (cosine + np.sqrt(a2 + (1 - a2) * cosine**2))
-    fresnel = _COAT_REFLECTANCE + (1 - _COAT_REFLECTANCE) * (1 - dot(halfway, towards_eye).clip(0, 1)) ** 5
+    fresnel = COAT_REFLECTANCE + (1 - COAT_REFLECTANCE) * (1 - dot(halfway, towards_eye).clip(0, 1)) ** 5
     return np.pi * distribution * shadowing * fresnel
 
 

@@ -197,7 +197,7 @@ def _gain_spread(cameras: Cameras, positions: Float[Tensor, "P 3"], seen: Seen) 
     smooth = torch.cat([torch.ones_like(directions[:, :1]), _up_to_second_degree(directions)], dim=-1)
     shared = []
     for half in (positions > positions.median(dim=0).values).T:
-        one, other = _view_gains(seen[half]), _view_gains(seen[~half])
+        one, other = view_gains(seen[half]), view_gains(seen[~half])
         both = one.isfinite() & other.isfinite()
         freedom = int(both.sum()) - smooth.shape[1]
         if freedom < _FEWEST_VIEWS:  # halves of a flight are seen by different views
@@ -208,7 +208,7 @@ def _gain_spread(cameras: Cameras, positions: Float[Tensor, "P 3"], seen: Seen) 
     return max(min(shared, default=0.0), 0.0) ** 0.5
 
 
-def _view_gains(seen: Seen) -> Float[Tensor, " N"]:
+def view_gains(seen: Seen) -> Float[Tensor, " N"]:
     """Logarithms of the views' gains, of mean 0, by which places look most alike; NaN where a view sees none.
 
     Least absolute differences of what a place looks like, gains taken off, from its mean over views; by repeated least

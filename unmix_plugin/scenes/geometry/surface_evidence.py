@@ -70,7 +70,7 @@ _CELLS = 64
 
 
 @dataclass(frozen=True)
-class _SweptDepths:
+class SweptDepths:
     """Distances of some pixels of some views."""
 
     views: tuple[int, ...]
@@ -81,7 +81,7 @@ class _SweptDepths:
     """Pixels of the whole view from one that is asked to the next; the first stands at `stride` / 2."""
 
 
-def _sweep_depths(views: Views, box: SceneBox) -> _SweptDepths | None:
+def sweep_depths(views: Views, box: SceneBox) -> SweptDepths | None:
     """Distances of the pixels of all views, or of `_MOST_VIEWS`, in a box of their cameras' space; None if views are
     too few, too small or too plain. All have one size and one pose each. Pixels that don't count stay unknown."""
     cameras, count = views.cameras, min(len(views.cameras), _MOST_VIEWS)
@@ -104,7 +104,7 @@ def _sweep_depths(views: Views, box: SceneBox) -> _SweptDepths | None:
         share = thinned.valid_share(view)
         if share is not None:
             distances.masked_fill_(share[every, every] < 1, torch.inf)
-    return _SweptDepths(tuple(chosen), found, thinned.stride * _PIXEL_STRIDE)
+    return SweptDepths(tuple(chosen), found, thinned.stride * _PIXEL_STRIDE)
 
 
 def _over_surroundings(image: Float[Tensor, "H W B"]) -> Float[Tensor, "H W B"]:
@@ -185,7 +185,7 @@ def _patch_means(differences: Differences, own: Float[Tensor, "H W F"]) -> Diffe
     return means.flatten(1).T
 
 
-def _seen_through(depths: _SweptDepths, cameras: Cameras, box: SceneBox, cells: int) -> Bool[Tensor, "C C C"]:
+def seen_through(depths: SweptDepths, cameras: Cameras, box: SceneBox, cells: int) -> Bool[Tensor, "C C C"]:
     """Cells of the world contracted around a box that are empty, so many along each edge, by depths of views of
     `cameras`."""
     space = UnitSpace(box, is_unbounded=True)
@@ -219,7 +219,7 @@ class SurfaceEvidence:
         views = training_views(scene)
         self._cameras, self._box = views.cameras, scene.scene_box
         is_compared = scene.is_unbounded and not scene.is_rig and views.cameras.key_poses is None
-        self._depths = _sweep_depths(views, scene.scene_box) if is_compared else None
+        self._depths = sweep_depths(views, scene.scene_box) if is_compared else None
         if self._depths is not None:
             swept = torch.full((len(self._cameras),), -1)
             swept[list(self._depths.views)] = torch.arange(len(self._depths.views))
@@ -230,7 +230,7 @@ class SurfaceEvidence:
         if self._depths is None:
             return reachable
         cells = min(len(reachable), _CELLS)
-        empty = _seen_through(self._depths, self._cameras, self._box, cells)
+        empty = seen_through(self._depths, self._cameras, self._box, cells)
         return reachable & ~refined(empty, len(reachable)).numpy()
 
     def points(self, pixels: DrawnPixels) -> Float[Tensor, "R 3"] | None:

@@ -228,7 +228,7 @@ def _local_change(image: Image) -> Float[Tensor, "h w"]:
 
 
 @dataclass(frozen=True)
-class _WorldEvidence:
+class WorldEvidence:
     """What pixels of the training views say."""
 
     num_pixels: int
@@ -246,7 +246,7 @@ class _WorldEvidence:
     has_plain_sides: bool = False
     """Whether plain surfaces that are no backdrop reach the borders of the views."""
 
-    def with_places(self, box: SceneBox, places: Float[Tensor, "P 3"]) -> _WorldEvidence:
+    def with_places(self, box: SceneBox, places: Float[Tensor, "P 3"]) -> WorldEvidence:
         """With what places say that features matched between views stand at."""
         outside = ((places - box.aabb.mean(dim=0)).abs() > _BOX_MARGIN * box.size / 2).any(dim=-1)
         return replace(self, num_places=len(places), num_outside=int(outside.sum()))
@@ -301,11 +301,11 @@ class _WorldEvidence:
         return [*known, (True, plain)] if self.has_plain_sides else known
 
 
-def find_world_evidence(box: SceneBox, views: Views) -> _WorldEvidence:
+def find_world_evidence(box: SceneBox, views: Views) -> WorldEvidence:
     """Ask where training views agree; the box is in their cameras' space."""
     found = _compare(views.cameras.camera_to_world.double().numpy(), views, _spread_pixels)
     if found is None:
-        return _WorldEvidence(0, 0, 0, 0)
+        return WorldEvidence(0, 0, 0, 0)
     nearest, farthest = _WORLD_DEPTHS
     depths = float(box.size.max()) / 2 / torch.linspace(1 / nearest, 1 / farthest, _NUM_DEPTHS)
     half = _BOX_MARGIN * box.size / 2
@@ -321,7 +321,7 @@ def find_world_evidence(box: SceneBox, views: Views) -> _WorldEvidence:
         )
     behind, inside = (torch.cat(parts) / found.chance for parts in zip(*sides, strict=True))
     is_clear = torch.minimum(behind, inside) < _MOST_UNEXPLAINED
-    return _WorldEvidence(
+    return WorldEvidence(
         len(inside),
         int((is_clear & (inside < _CLEARLY * behind)).sum()),
         int((is_clear & (behind < _CLEARLY * inside)).sum()),
