@@ -1,5 +1,6 @@
 """The surface of a scene: where its cameras see it, closed or cut to what they see."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 import torch
 import trimesh
 
-from tests.factories.ball_model import FROM_ABOVE, INNER_RADIUS, RADIUS, ball_scene, cameras_around
+from tests.factories.ball_model import FROM_ABOVE, INNER_RADIUS, RADIUS, BallField, ball_scene, cameras_around
 from tests.factories.cameras import around
 from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.trained.run_views import RunView
@@ -29,6 +30,34 @@ def test_a_hollow_ball_is_one_closed_surface_where_the_ball_ends():
     assert abs(radius.mean() - RADIUS) < SCENE.pixel_size / 4
     assert mesh.volume > 0
     assert 0 <= unseen < 1
+
+
+class LeakingBall(BallField):
+    """A hollow ball with a hole along a line of sight from its middle."""
+
+    def __init__(self, towards: torch.Tensor) -> None:
+        super().__init__()
+        self.towards = torch.nn.functional.normalize(towards, dim=0)
+
+    def density_of(self, encoded: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        along = encoded @ self.towards
+        beside = (encoded - along[:, None] * self.towards).norm(dim=-1)
+        density, features = super().density_of(encoded)
+        return torch.where((along > 0) & (beside < 0.25), 0.0, density), features
+
+
+def test_a_solid_has_no_hollow_that_one_camera_alone_looks_into():
+    below = (0.05, 0.0, -1.0)
+    ring = [
+        (math.cos(angle), math.sin(angle), 1.0) for angle in np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    ]
+    cameras = cameras_around([*ring, below])
+    views = tuple(RunView(str(index), camera) for index, camera in enumerate(cameras))
+    leaking = replace(SCENE, field=LeakingBall(torch.tensor(below)), views=views)
+    closed, _ = surface_of(leaking, keeps_unseen=True)
+    assert np.linalg.norm(closed.vertices, axis=1).min() > 0.9 * RADIUS
+    shown, _ = surface_of(leaking)
+    assert np.linalg.norm(shown.vertices, axis=1).min() < INNER_RADIUS
 
 
 def test_normals_are_of_length_1_and_face_outwards():
@@ -92,7 +121,7 @@ def test_stray_pieces_go_and_large_ones_stay():
 
 
 def test_nothing_seen_is_refused(monkeypatch):
-    monkeypatch.setattr(SeenSurface, "signed_distance", lambda _, points, __: torch.ones(len(points)))
+    monkeypatch.setattr(SeenSurface, "signed_distance", lambda _, points, *__, **___: torch.ones(len(points)))
     with pytest.raises(RunError, match="train longer"):
         surface_of(SCENE)
     with pytest.raises(ConfigError, match="--resolution is 4; choose 8 to 1024"):

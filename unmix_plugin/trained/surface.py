@@ -40,6 +40,8 @@ _TOLERANCE_PX = 2.0
 """Difference of distances, in pixels as large as they are at the point, that still counts as the same surface."""
 _FEWEST_IMAGES = 3
 """In which a point is hidden that counts as inside: one alone may have it behind something at its edge."""
+_MANY_IMAGES = 8
+"""That have a point in them, of which more than one should see it: a third of those all around an object do."""
 _SCALE_BOUNDS = (1 / 16, 4.0)
 _SIDE_PX = 24
 """Least side of an image that surfaces are looked for in."""
@@ -130,10 +132,13 @@ class SeenSurface:
         confirmed, seen_through = self._votes(positions, tolerance)
         return (confirmed >= 1) & (seen_through <= confirmed)
 
-    def signed_distance(self, positions: Float[Tensor, "P 3"], reach_px: float) -> Float[Tensor, " P"]:
+    def signed_distance(
+        self, positions: Float[Tensor, "P 3"], reach_px: float, is_closed: bool = False
+    ) -> Float[Tensor, " P"]:
         """How far points lie before what the cameras see, means over those that see them or see what hides them by less
         than `reach_px` pixels of the scene's images, as parts of that, at most 1; -1 behind all that the
-        images show, 1 where too few have the points in them.
+        images show, 1 where too few have the points in them. Of a closed solid, one camera alone opens no hollow that
+        many don't look into: how far it sees there was never learnt.
 
         Source: Curless and Levoy 1996, A Volumetric Method for Building Complex Models from Range Images.
         """
@@ -146,6 +151,8 @@ class SeenSurface:
             sums[rows] += parts[parts > -1]
             counts[rows] += 1
             images += inside
+        if is_closed:
+            counts[(counts == 1) & (images > _MANY_IMAGES)] = 0
         is_hidden = images >= min(_FEWEST_IMAGES, len(self._views))
         return torch.where(counts > 0, sums / counts.clamp(min=1), torch.where(is_hidden, -1.0, 1.0))
 
