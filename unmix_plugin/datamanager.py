@@ -39,7 +39,7 @@ from unmix_plugin.scenes.evidence import (
     judge_sensors,
     relative_power,
 )
-from unmix_plugin.scenes.geometry.carving import Cells, Masks, carve, share_contradicted, share_explained
+from unmix_plugin.scenes.geometry.carving import Cells, Masks, carve, carve_by_masks, share_explained
 from unmix_plugin.scenes.geometry.lighting import judge_exposure, judge_light
 from unmix_plugin.scenes.geometry.matched_points import find_matched_points
 from unmix_plugin.scenes.geometry.surface_evidence import SurfaceEvidence
@@ -308,13 +308,12 @@ class HyperspectralDataManager(DataManager):
     @cached_property
     def _carved(self) -> tuple[Cells, Finding | None]:
         """Where something may be, and what to say of masks that contradict each other; all pixels are read for it."""
-        foreground = self._foreground
-        hull = self._surfaces.carved(carve(self.scene, self.options.grid_resolution, foreground))
-        if (
-            foreground is None or self.scene.is_unbounded or self.scene.has_backdrop
-        ):  # which was tried by that
-            return hull, None
-        return hull, check_masks(share_contradicted(self.train_cameras, foreground, self.scene_box))
+        foreground, cells = self._foreground, self.options.grid_resolution
+        if foreground is None or self.scene.is_unbounded:
+            return self._surfaces.carved(carve(self.scene, cells, foreground)), None
+        hull, contradicted = carve_by_masks(self.train_cameras, foreground, self.scene_box, cells)
+        # A backdrop was tried by that.
+        return self._surfaces.carved(hull), None if self.scene.has_backdrop else check_masks(contradicted)
 
     @property
     def _foreground(self) -> Masks | None:

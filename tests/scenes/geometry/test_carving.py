@@ -17,7 +17,8 @@ from unmix_plugin.scenes.doctor import check_masks
 from unmix_plugin.scenes.evidence import AlphaEvidence
 from unmix_plugin.scenes.geometry import carving
 from unmix_plugin.scenes.geometry.bounds import find_bounds
-from unmix_plugin.scenes.geometry.carving import carve, carve_box
+from unmix_plugin.scenes.geometry.carving import carve, carve_box, carve_by_masks, share_contradicted
+from unmix_plugin.scenes.geometry.footprints import PixelView
 from unmix_plugin.scenes.messages import Message
 from unmix_plugin.scenes.pixel_table import PixelTable
 from unmix_plugin.scenes.reading.loader import load_scene
@@ -238,9 +239,43 @@ def test_poses_that_are_off_by_several_pixels_are_told_and_right_ones_raise_no_a
     scene = turned(demo, turn)
     foreground = [alpha > 0 for alpha in alphas if alpha is not None]
     cameras = scene.cameras[list(scene.train_indices)]
-    found = check_masks(carving.share_contradicted(cameras, foreground, scene.scene_box))
+    found = check_masks(share_contradicted(cameras, foreground, scene.scene_box))
     assert (None if found is None else found.code) == (Message.MASKS_CONTRADICT if is_told else None)
     assert found is None or found.values["share"] > 0.05
+
+
+@pytest.mark.parametrize("focal_px", [FOCAL, 3 * FOCAL])
+@pytest.mark.parametrize(("fewest_views", "witnesses"), [(1, 1), (5, 2)])
+def test_a_view_is_asked_once_of_what_it_shows_all_over_and_the_hull_stays_the_same(
+    focal_px, fewest_views, witnesses, monkeypatch
+):
+    poses = ring_poses(8)
+    cameras = replace(make_cameras(poses), focal_px=torch.full((8, 2), float(focal_px)))
+    foreground = [ball_alpha(pose, 0.6, SIDE, SIDE, focal_px) > 0 for pose in poses]
+    judge, asked = PixelView.judge, []
+
+    def counted(view, centres, half, near):
+        asked.append(centres.shape[1])
+        return judge(view, centres, half, near)
+
+    monkeypatch.setattr(PixelView, "judge", counted)
+    once = carve_box(cameras, foreground, BOX, 64, fewest_views, witnesses)
+    number = sum(asked)
+    asked.clear()
+    monkeypatch.setattr(PixelView, "judge", lambda *args: replace(counted(*args), is_settled=None))
+    np.testing.assert_array_equal(carve_box(cameras, foreground, BOX, 64, fewest_views, witnesses), once)
+    assert once.any()
+    assert number < 0.8 * sum(asked)
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.1])
+def test_carving_tells_what_masks_contradict_as_asking_for_that_alone_does(demo, turn):
+    scene = turned(demo, turn)
+    foreground = [demo.alpha(index) > 0 for index in demo.train_indices]
+    cameras = scene.cameras[list(scene.train_indices)]
+    contradicted = carve_by_masks(cameras, foreground, scene.scene_box, 32)[1]
+    assert contradicted == share_contradicted(cameras, foreground, scene.scene_box)
+    assert (contradicted > 0.05) == (turn > 0)
 
 
 def test_a_point_on_the_right_or_lower_edge_of_an_image_is_outside_as_everywhere():

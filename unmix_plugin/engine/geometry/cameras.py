@@ -229,14 +229,17 @@ class Cameras:
         depths = -local[:, 2]
         # Points on the camera plane have no image; any finite number does, since the caller looks at the depth.
         divisor = torch.where(depths.abs() < 1e-12, torch.full_like(depths, 1e-12), depths)
-        coords = torch.stack([local[:, 0], -local[:, 1]], dim=-1) / divisor[:, None]
+        # One axis at a time: a last axis of two takes thrice as long.
+        x, y = local[:, 0] / divisor, -local[:, 1] / divisor
         if self.is_distorted:
+            coords = torch.stack([x, y], dim=-1)
             depths = torch.where(coords.norm(dim=-1) < _fold_radius(self.distortion[index]), depths, -1.0)
-            coords = distort(coords, self.distortion[index])
-        pixels = coords * self.focal_px[index] + self.center_px[index]
+            x, y = distort(coords, self.distortion[index]).unbind(-1)
+        focal, center = self.focal_px[index], self.center_px[index]
+        columns = x * focal[0] + center[0]
         if rows is None:
-            return pixels, depths
-        return torch.stack([pixels[:, 0], rows], dim=-1), torch.where(depths > 0, depths, -1.0)
+            return torch.stack([columns, y * focal[1] + center[1]], dim=-1), depths
+        return torch.stack([columns, rows], dim=-1), torch.where(depths > 0, depths, -1.0)
 
     def to_json(self) -> dict[str, Any]:
         """The cameras as numbers and lists; `from_json` restores the same bits."""

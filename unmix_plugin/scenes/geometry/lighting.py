@@ -31,6 +31,7 @@ from torch import Tensor
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.scenes.geometry.carving import Cells
+from unmix_plugin.scenes.geometry.filters import gaussian_blur, inner_cells, mean_3x3
 from unmix_plugin.scenes.geometry.views import look_up
 
 Pictures = list[Float[np.ndarray, "H W"]]
@@ -69,13 +70,9 @@ class Places:
 
 def _hull_places(hull: Cells, box: SceneBox) -> Places:
     """Evenly thinned-out cells on the surface of a hull, with their normals."""
-    from scipy import ndimage  # slow to import
-
-    inner = np.array(ndimage.binary_erosion(hull, border_value=1), dtype=bool)
-    surface = hull & ~inner
-    cells = np.argwhere(surface)
+    cells = np.argwhere(hull & ~inner_cells(hull))
     cells = cells[:: max(1, -(-len(cells) // _NUM_PLACES))]
-    blurred = ndimage.gaussian_filter(hull.astype(np.float32), _SMOOTHING_CELLS)
+    blurred = gaussian_blur(hull.astype(np.float32), _SMOOTHING_CELLS)
     sides = np.array(hull.shape)
     gradient = [np.asarray(part) for part in np.gradient(blurred)]
     slopes = np.stack(gradient, axis=-1)[tuple(cells.T)] * (sides / box.size.numpy())
@@ -115,11 +112,9 @@ def coarse_hull(hull: Cells) -> Bool[np.ndarray, "r r r"]:
 
 def local_log_brightness(seen: Float[Tensor, "H W"]) -> Float[np.ndarray, "H W"]:
     """Logarithm of the mean brightness of 3 x 3 pixels, of those that are above 0; NaN where the middle one isn't."""
-    from scipy import ndimage  # slow to import
-
     known = (seen > 0).numpy()
-    weights = ndimage.uniform_filter(known.astype(np.float32), 3)
-    means = ndimage.uniform_filter(np.where(known, seen.numpy(), 0.0), 3) / np.maximum(weights, 1e-6)
+    weights = mean_3x3(known.astype(np.float32))
+    means = mean_3x3(np.where(known, seen.numpy(), np.float32(0))) / np.maximum(weights, 1e-6)
     return np.where(known, np.log(np.where(known, means, 1.0)), np.nan)
 
 

@@ -103,8 +103,8 @@ def look_up(
 ) -> tuple[Float[Tensor, "P 2"], Float[Tensor, " P"], Bool[Tensor, " P"]]:
     """Where points are in a view, pixels, their depths, and whether they lie within it and before its camera."""
     coords, depths = cameras.project(points, view)
-    size = torch.tensor(cameras.size(view))
-    return coords, depths, (depths > 0) & ((coords >= 0) & (coords < size)).all(dim=-1)
+    (x, y), (width, height) = coords.unbind(-1), cameras.size(view)
+    return coords, depths, (depths > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
 
 
 def choose_neighbours(
@@ -149,8 +149,8 @@ def view_differences(
     """Between pixels and what another view shows of points along their rays; inf where that does not see them."""
     points = rays.origins[:, None] + rays.directions[:, None] * distances[..., None]
     coords, depths = cameras.project(points.flatten(0, 1), view)
-    size = torch.tensor([cameras.width, cameras.height])
-    is_seen = (depths > 0.0) & ((coords > 0.5) & (coords < size - 0.5)).all(dim=-1)
+    (x, y), size = coords.unbind(-1), torch.tensor([cameras.width, cameras.height])
+    is_seen = (depths > 0.0) & (x > 0.5) & (x < size[0] - 0.5) & (y > 0.5) & (y < size[1] - 0.5)
     grid = (coords / size * 2.0 - 1.0).clamp(-2.0, 2.0)[None, :, None]
     sampled = torch.nn.functional.grid_sample(image.permute(2, 0, 1)[None], grid, align_corners=False)
     # Features first: a norm along a last axis of a few numbers takes ten times as long.

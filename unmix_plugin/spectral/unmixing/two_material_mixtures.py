@@ -87,18 +87,19 @@ def distances_to_pairs(
 
     Computed in the inputs' type, which should be float64: the square of a small distance is a difference of ones.
     """
-    overlaps, cosines = shapes @ candidates.T, candidates @ candidates.T
+    overlaps, cosines = candidates @ shapes.T, candidates @ candidates.T
     alone = 1 - overlaps.clamp(min=0).square()
     distances = torch.empty(len(candidates), len(candidates), len(shapes), device=shapes.device)
     for first in range(len(candidates)):
-        cosine, overlap = cosines[first], overlaps[:, first, None]
+        cosine, overlap, others = cosines[first, first:, None], overlaps[first], overlaps[first:]
         volume = (1 - cosine.square()).clamp(min=1e-9)
-        of_first, of_second = (overlap - cosine * overlaps) / volume, (overlaps - cosine * overlap) / volume
-        mixed = 1 - of_first * overlap - of_second * overlaps
+        of_first, of_second = (overlap - cosine * others) / volume, (others - cosine * overlap) / volume
+        mixed = 1 - of_first * overlap - of_second * others
         inside = (of_first > 0) & (of_second > 0)
-        squared = torch.where(inside, mixed, torch.minimum(alone[:, first, None], alone))
-        squared[:, first] = alone[:, first]
-        distances[first] = squared.clamp(min=0).sqrt().T
+        squared = torch.where(inside, mixed, torch.minimum(alone[first], alone[first:]))
+        squared[0] = alone[first]
+        distances[first, first:] = squared.clamp_(min=0).sqrt_()
+        distances[first + 1 :, first] = distances[first, first + 1 :]
     return distances
 
 
