@@ -133,19 +133,25 @@ def match_poses(
     """
     owners = {name: [name, *camera.other_names] for name, camera in poses.cameras.items()}
     wanted = {name: [name, *(str(file) for file in files)] for name, files in views}
-    is_by_order = all(name.startswith(BY_ORDER) for name in owners)
+    found: dict[str, str] = {}
+    is_by_order, how = all(name.startswith(BY_ORDER) for name in owners), "by name"
+    if is_by_order and len(owners) != len(wanted):
+        raise CaptureError(f"{len(owners)} poses without names and {len(wanted)} views; expected as many")
     if is_by_order:
-        if len(owners) != len(wanted):
-            raise CaptureError(f"{len(owners)} poses without names and {len(wanted)} views; expected as many")
         found, how = (
             dict(zip(sorted(wanted), owners, strict=True)),
             "by their order, as the poses have no names",
         )
-    else:
-        found, how = _by_names(owners, wanted), "by name"
+    for key in () if is_by_order else _KEYS:
+        cameras, views_of = _owners_of(owners, key), _owners_of(wanted, key)
+        for name, those in views_of.items():
+            hits = cameras.get(name, set()) - {*found.values()}
+            if len(those) == len(cameras.get(name, ())) == len(hits) == 1 and not those & found.keys():
+                (view,), (camera,) = those, hits
+                found[view] = camera
     if not found:
-        cameras, named = _cores(owners), _cores(wanted)
-        found = {named[core]: cameras[core] for core in named if core in cameras}
+        cores, named = _cores(owners), _cores(wanted)
+        found = {named[core]: cores[core] for core in named if core in cores}
         how = "by the part of the names that differs"
     if not found:
         raise CaptureError(
@@ -174,19 +180,6 @@ def match_poses(
         if of_cameras and {number + apart for number in of_views} == of_cameras
     ]
     return {view: poses.cameras[found[view]] for view in wanted if view in found}, remarks
-
-
-def _by_names(owners: dict[str, list[str]], wanted: dict[str, list[str]]) -> dict[str, str]:
-    found: dict[str, str] = {}
-    taken: set[str] = set()
-    for key in _KEYS:
-        cameras, views = _owners_of(owners, key), _owners_of(wanted, key)
-        for name, those in views.items():
-            hits = cameras.get(name, set()) - taken
-            if len(those) == len(cameras.get(name, ())) == len(hits) == 1 and not those & found.keys():
-                found |= zip(those, hits, strict=True)
-                taken |= hits
-    return found
 
 
 def _cores(names: Iterable[str]) -> dict[str, str]:

@@ -141,7 +141,12 @@ def measure_distance(views: Views, before: BeforeBackdrop) -> BackgroundDistance
     far = min(differing(directions), differing(places))
     if not radius > 0:  # cameras at one place see no distance
         return BackgroundDistance(far, far)
-    spheres = [_on_sphere(from_centre, directions, factor * radius) for factor in _RADII]
+    # Where rays, which start within each sphere around the centre, meet it; in its radii.
+    along, squared = (from_centre * directions).sum(axis=1), (from_centre**2).sum(axis=1)
+    spheres = []
+    for reach in (factor * radius for factor in _RADII):
+        ahead = np.sqrt(np.maximum(along**2 - squared + reach**2, 0.0)) - along
+        spheres.append((from_centre + ahead[:, None] * directions) / reach)
     return BackgroundDistance(far, min(map(differing, spheres)))
 
 
@@ -173,15 +178,6 @@ def _background(views: Views, before: BeforeBackdrop) -> Iterator[_Background]:
         directions = torch.nn.functional.normalize(rays.directions.double(), dim=-1).numpy()
         places = 2 * coords.double().numpy() / np.array(before.size) - 1
         yield _Background(seen, rays.origins.double().numpy(), directions, places, brightest)
-
-
-def _on_sphere(
-    origins: Float64[np.ndarray, "P 3"], directions: Float64[np.ndarray, "P 3"], radius: float
-) -> Float64[np.ndarray, "P 3"]:
-    """Where rays that start within a sphere around 0 meet it, in radii."""
-    along = (origins * directions).sum(axis=1)
-    inside = np.maximum(along**2 - (origins**2).sum(axis=1) + radius**2, 0.0)
-    return (origins + (np.sqrt(inside) - along)[:, None] * directions) / radius
 
 
 def _share_that_differs(

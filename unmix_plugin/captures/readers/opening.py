@@ -163,34 +163,33 @@ def _file_kind(path: Path) -> str:
         raise CaptureError(f"{path}: the file is empty; copy it again")
     if begin.startswith(_LFS_POINTER):
         raise CaptureError(f"{path}: a pointer of Git LFS, not the file itself; fetch it with 'git lfs pull'")
-    kind = _by_content(path, begin)
-    if kind is None:
-        raise CaptureError(f"{path}: of no known kind: begins with {begin[:8]!r}; expected {_KNOWN}")
-    return kind
-
-
-def _by_content(path: Path, begin: bytes) -> str | None:
     kind = next((kind for magic, kind in _BEGINNINGS.items() if begin.startswith(magic)), None)
     if kind is not None:
         return kind
     if any(begin[start : start + 8] == b"\x89HDF\r\n\x1a\n" for start in _HDF5_STARTS):
         return "hdf5"
     if begin.startswith(b"PK\x03\x04") and zipfile.is_zipfile(path):
-        with open_zip(path, CaptureError) as archive:
-            names = archive.namelist()
-        if any(name.endswith("/data.pkl") for name in names):
-            raise CaptureError(f"{path}: {_OF_TORCH}")
-        if names and all(name.endswith(".npy") for name in names):
-            return "npz"
-        raise CaptureError(f"{path}: a zip archive ({', '.join(names[:3]) or 'empty'}); unpack it first")
-    if is_envi_header(path) or (path.suffix.lower() != ".hdr" and header_beside(path) is not None):
+        return _kind_of_archive(path)
+    suffix = path.suffix.lower()
+    if is_envi_header(path) or (suffix != ".hdr" and header_beside(path) is not None):
         return "envi"
     refused = next((why for magic, why in _REFUSED.items() if begin.lstrip().startswith(magic)), None)
-    if refused is not None:
-        raise CaptureError(f"{path}: {refused}")
-    if path.suffix.lower() in (".pt", ".pth"):
+    if refused is not None or suffix in (".pt", ".pth"):
+        raise CaptureError(f"{path}: {refused or _OF_TORCH}")
+    if suffix not in _SUFFIXES:
+        raise CaptureError(f"{path}: of no known kind: begins with {begin[:8]!r}; expected {_KNOWN}")
+    return _SUFFIXES[suffix]
+
+
+def _kind_of_archive(path: Path) -> str:
+    """`npz`; others are refused. Raises CaptureError."""
+    with open_zip(path, CaptureError) as archive:
+        names = archive.namelist()
+    if any(name.endswith("/data.pkl") for name in names):
         raise CaptureError(f"{path}: {_OF_TORCH}")
-    return _SUFFIXES.get(path.suffix.lower())
+    if not names or not all(name.endswith(".npy") for name in names):
+        raise CaptureError(f"{path}: a zip archive ({', '.join(names[:3]) or 'empty'}); unpack it first")
+    return "npz"
 
 
 def inspect_file(path: Path, options: ReadOptions | None = None) -> dict[str, Any]:

@@ -92,10 +92,17 @@ def find_matched_points(views: Views) -> MatchedPoints | None:
     Line cameras may be among them. Pixels that don't count have no feature and no brightness.
     """
     cameras, thinned = views.cameras, ThinnedViews(views, LONGEST_SIDE_PX)
-    pairs = _choose_pairs(cameras.camera_to_world[:, :, 3])
+    # Some views and others beside them, each pair once; views at one place tell no distance.
+    positions, pairs = cameras.camera_to_world[:, :, 3].double(), set()
+    away = torch.cdist(positions, positions)
+    for view in evenly_spaced(len(positions), _MOST_REFERENCES):
+        others = [other for other in away[view].argsort().tolist() if away[view, other] > 1e-6 * away.max()]
+        near = [others[rank] for rank in _NEIGHBOUR_RANKS if rank < len(others)]
+        pairs |= {(min(view, other), max(view, other)) for other in near}
     features = {view: _features_of(thinned, view) for view in sorted({*sum(pairs, ())})}
     found = [
-        _triangulate(cameras, thinned.stride, pair, features[pair[0]], features[pair[1]]) for pair in pairs
+        _triangulate(cameras, thinned.stride, pair, features[pair[0]], features[pair[1]])
+        for pair in sorted(pairs)
     ]
     if sum(len(points.depths) for points in found) < _LEAST_POINTS:
         return None
@@ -110,18 +117,6 @@ class _Features:
     """In the whole view, pixels."""
     descriptors: Float32[np.ndarray, "F 128"]
     log_brightness: Float[Tensor, " F"]
-
-
-def _choose_pairs(positions: Float[Tensor, "N 3"]) -> list[tuple[int, int]]:
-    """Some views and others beside them, each pair once; views at one place tell no distance."""
-    away = torch.cdist(positions.double(), positions.double())
-    pairs = set()
-    for view in evenly_spaced(len(positions), _MOST_REFERENCES):
-        others = [other for other in away[view].argsort().tolist() if away[view, other] > 1e-6 * away.max()]
-        for rank in _NEIGHBOUR_RANKS:
-            if rank < len(others):
-                pairs.add((min(view, others[rank]), max(view, others[rank])))
-    return sorted(pairs)
 
 
 def _features_of(thinned: ThinnedViews, view: int) -> _Features:
