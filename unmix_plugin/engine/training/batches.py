@@ -42,22 +42,22 @@ def work_on_batches(pipeline: Pipeline, step: int) -> list[BatchResult]:
         ConfigError: the model's losses can't be added up.
     """
     threads, rays = torch.get_num_threads(), pipeline.datamanager.get_train_rays_per_batch()
-    count = min(pipeline.model.batches_at_once, threads, rays)
-    if count == 1 or pipeline.model.device.type != "cpu":
+    is_one = min(pipeline.model.batches_at_once, threads, rays) == 1
+    if is_one or pipeline.model.device.type != "cpu":
         (batch,) = pipeline.train_batches(step)
         return [_gradients(batch, pipeline.model, 1.0)]
 
     def work(batch: Callable[[], TrainOutputs]) -> BatchResult:
-        with _num_threads(threads // count):
-            return _gradients(batch, pipeline.model, 1 / count)
+        with _num_threads(threads // 2):
+            return _gradients(batch, pipeline.model, 0.5)
 
-    first, *others = pipeline.train_batches(step, count)
-    started = [_workers().submit(work, batch) for batch in others]
+    batches = pipeline.train_batches(step, 2)
+    beside = _worker().submit(work, next(batches))  # while the next is drawn
     try:
-        own = work(first)
+        own = work(next(batches))
     finally:
-        found = [batch.result() for batch in started]
-    return [own, *found]
+        other = beside.result()
+    return [other, own]
 
 
 def _gradients(batch: Callable[[], TrainOutputs], model: Model, share: float) -> BatchResult:
@@ -70,7 +70,7 @@ def _gradients(batch: Callable[[], TrainOutputs], model: Model, share: float) ->
 
 
 @cache
-def _workers() -> ThreadPoolExecutor:
+def _worker() -> ThreadPoolExecutor:
     """The thread that works beside the one that trains."""
     return ThreadPoolExecutor(1, thread_name_prefix="unmix-batch")
 
