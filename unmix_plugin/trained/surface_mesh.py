@@ -36,8 +36,8 @@ SMOOTHING_PX = 0.75
 """Standard deviation of the blur; sharp edges get as round as this."""
 _COARSER, _NEAR = 4, 0.5
 """Cells of the grid that are one of a coarse one; the part of the reach within which distances are measured finely."""
-_AREA_RINGS = 4
-"""Neighbours over which normals along which areas are taken are smoothed."""
+_RINGS = 4
+"""Neighbours over which normals are smoothed."""
 _HEALED_RINGS = 3
 """Gaps of this many vertices between what is seen are not cut: two cameras rarely agree at an edge."""
 _LARGEST_HOLE_PX = 8.0
@@ -87,11 +87,16 @@ class TriangleMesh:
         lengths = np.linalg.norm(sums, axis=1, keepdims=True)
         return np.where(lengths > 0, sums / np.where(lengths > 0, lengths, 1.0), [0.0, 0.0, 1.0])
 
+    def smoothed_normals(self) -> Float64[np.ndarray, "V 3"]:
+        """Unit normals of the vertices, each the mean of those around it: of a surface that a short training left
+        rough, they are nearer to the true ones."""
+        smooth = np.stack([self.smoothed(axis, _RINGS) for axis in self.normals.T], axis=1)
+        return smooth / np.linalg.norm(smooth, axis=1, keepdims=True).clip(min=1e-12)
+
     def areas(self) -> Float64[np.ndarray, " F"]:
         """Of the faces, as large as they are seen along the smoothed normal: rough surfaces of short trainings have
         more area than what they stand for."""
-        smooth = np.stack([self.smoothed(axis, _AREA_RINGS) for axis in self.normals.T], axis=1)
-        along = smooth[self.faces].sum(axis=1)
+        along = self.smoothed_normals()[self.faces].sum(axis=1)
         along /= np.linalg.norm(along, axis=1, keepdims=True).clip(min=1e-12)
         a, b, c = self.vertices[self.faces].swapaxes(0, 1)
         return np.maximum((np.cross(b - a, c - a) * along).sum(axis=1) / 2, 0.0)

@@ -49,11 +49,11 @@ from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectr
 from unmix_plugin.trained.camera_files import camera_entry
 from unmix_plugin.trained.open_run import LoadedRun, find_scene, load_run
 from unmix_plugin.trained.run_views import positions_for_files
-from unmix_plugin.trained.surface_mesh import surface_of
+from unmix_plugin.trained.surface_mesh import TriangleMesh, surface_of
 
 _NUM_POINTS, _MOST_PIXELS, _SEED = 5000, 2_000_000, 0
 """Pixels that the light is found from, and of how many they are drawn."""
-_RECIPE_FILE, _VERSION = "made_of.json", 1
+_RECIPE_FILE, _VERSION = "made_of.json", 2
 """What a folder was made of, written last; the version of how."""
 _MOST_UNSEEN = 0.02
 """Part of the surface that no camera sees, from which that is worth a word."""
@@ -246,7 +246,10 @@ def _write_mesh(folder: Path, recipe: ObjectRecipe, loaded: LoadedRun, say: Say)
         found = fast_simplification.simplify(vertices, faces, target_count=recipe.num_triangles)
         vertices, faces = found[:2]
     vertices = positions_for_files(loaded.scene.frame.to_world(vertices))
+    # Highlights show where a surface faces: of a rough one, normals are smoothed, places stay.
+    normals = TriangleMesh(vertices, faces).smoothed_normals().astype(np.float32)
     columns = {name: vertices[:, axis] for axis, name in enumerate("xyz")}
+    columns |= {name: normals[:, axis] for axis, name in enumerate(("nx", "ny", "nz"))}
     write_ply(folder / "mesh.ply", columns, faces, ("surface of an unmix-nerf run",))
     guess = (
         f"{unseen:.0%} of it no camera sees, which is closed by a guess: capture the object from there, too"
