@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from skimage.feature import SIFT
 
 from tests.factories.files import present
 from tests.factories.ground_views import (
@@ -77,6 +78,21 @@ def test_what_masks_leave_out_is_no_feature_and_does_not_tell_exposures():
             coords, _ = cameras.project(found.places[found.pairs[:, end] == view], view)
             assert float(coords[:, 0].max()) < WIDTH * 2 // 5 - 7.5
     assert find_matched_points(views_of(cameras, views, lambda _: valid & False)) is None
+
+
+def test_features_of_a_view_are_looked_for_once_and_anew_where_a_pixel_changes(monkeypatch):
+    sought, detect = [], SIFT.detect_and_extract
+    monkeypatch.setattr(SIFT, "detect_and_extract", lambda *args: (sought.append(1), detect(*args)))
+    cameras = flight_cameras(flight_poses())[[0, 1]]
+    pictures = ground_views(cameras)
+    first = find_matched_points(views_of(cameras, pictures))
+    count = len(sought)
+    again = find_matched_points(views_of(cameras, pictures))
+    assert len(sought) == count
+    assert torch.equal(present(again).places, present(first).places)
+    pictures[0][5, 5] += 0.01
+    find_matched_points(views_of(cameras, pictures))
+    assert len(sought) == count + 1
 
 
 def test_views_that_share_nothing_show_one_colour_or_stand_at_one_place_have_no_matched_places():

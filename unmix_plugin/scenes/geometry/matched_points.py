@@ -11,7 +11,8 @@ Source: features and their matches as in Lowe 2004, Distinctive Image Features f
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -46,6 +47,8 @@ _BRIGHT = 0.99
 """Quantile of a view's brightness that is taken for white."""
 _REACH = 7.5
 """Half the edge of what a descriptor looks at, in the width of its feature."""
+_MOST_KEPT = 64
+"""Views whose features are kept: reading a scene and judging its light look for those of the same views."""
 _SPECK_PX = 3
 """Along an edge of the thinned-out view; smaller parts that are not valid, such as dead pixels, spoil no descriptor."""
 
@@ -114,18 +117,29 @@ class _Features:
     """What stands out in a view."""
 
     coords: Float[Tensor, "F 2"]
-    """In the whole view, pixels."""
+    """Pixels."""
     descriptors: Float32[np.ndarray, "F 128"]
     log_brightness: Float[Tensor, " F"]
 
 
 def _features_of(thinned: ThinnedViews, view: int) -> _Features:
-    from scipy import ndimage  # slow to import
-    from skimage.feature import SIFT
-
     brightness = thinned.read(view).mean(dim=-1).nan_to_num(0.0, 0.0, 0.0)
     share = thinned.valid_share(view)
     counts = torch.ones_like(brightness, dtype=torch.bool) if share is None else share == 1
+    found = _features_in(brightness.numpy().tobytes(), counts.numpy().tobytes(), tuple(brightness.shape))
+    return replace(found, coords=thinned.whole(found.coords))
+
+
+@lru_cache(maxsize=_MOST_KEPT)
+def _features_in(brightness_bytes: bytes, counts_bytes: bytes, shape: tuple[int, ...]) -> _Features:
+    """In a view thinned out, with coordinates in it, by the values of float32 pixels and which of these count."""
+    from scipy import ndimage  # slow to import
+    from skimage.feature import SIFT
+
+    brightness, counts = (
+        torch.from_numpy(np.frombuffer(values, dtype=dtype).reshape(shape).copy())
+        for values, dtype in ((brightness_bytes, np.float32), (counts_bytes, np.bool_))
+    )
     sift = SIFT(upsampling=1)
     try:
         dark, bright = brightness[counts].quantile(torch.tensor([1 - _BRIGHT, _BRIGHT]))
@@ -144,7 +158,7 @@ def _features_of(thinned: ThinnedViews, view: int) -> _Features:
             coords, rows, columns = (values[kept] for values in (coords, rows, columns))
             descriptors = descriptors[kept.numpy()]
     seen = local_log_brightness(torch.where(counts, brightness, 0.0))
-    return _Features(thinned.whole(coords), descriptors, torch.from_numpy(seen).float()[rows, columns])
+    return _Features(coords, descriptors, torch.from_numpy(seen).float()[rows, columns])
 
 
 def _triangulate(
