@@ -84,13 +84,18 @@ class Pipeline(nn.Module):
         if count == 1:
             yield partial(self.model.get_train_loss_dict, *self.datamanager.next_train(step))
             return
-        num_rays = self.datamanager.get_train_rays_per_batch() // count
+        data, num_rays = self.datamanager, self.datamanager.get_train_rays_per_batch()
         for batch in range(count):
-            data, model = copy(self.datamanager), copy(self.model)
-            data.seed = step_seed(self.seed, batch, _BATCH_STREAM)
-            data.set_train_rays_per_batch(num_rays)
-            model.generator = step_generator(data.seed, step, data.device, _MODEL_STREAM)
-            yield partial(model.get_train_loss_dict, *data.next_train(step))
+            model, seed = copy(self.model), step_seed(self.seed, batch, _BATCH_STREAM)
+            model.generator = step_generator(seed, step, data.device, _MODEL_STREAM)
+            data.seed = seed
+            data.set_train_rays_per_batch(num_rays // count)
+            try:
+                drawn = data.next_train(step)
+            finally:
+                data.seed = self.seed
+                data.set_train_rays_per_batch(num_rays)
+            yield partial(model.get_train_loss_dict, *drawn)
 
     @torch.no_grad()
     def evaluate_images(self) -> Iterator[tuple[str, dict[str, float], dict[str, Tensor]]]:
