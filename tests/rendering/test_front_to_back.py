@@ -56,6 +56,20 @@ def test_what_is_left_out_costs_no_more_than_in_the_careful_way(monkeypatch, sma
     assert (errors[0] < errors[1] + 2 * smallest).all()
 
 
+def test_two_threads_that_share_a_view_find_what_one_does():
+    renderer, field = textured(4e-3, 0.3)
+    bundle = rays(5001)
+    alone = composite(renderer, field, bundle)
+    torch.set_num_threads(2)
+    try:
+        shared = composite(renderer, field, bundle)
+    finally:
+        torch.set_num_threads(1)
+    assert shared.num_endmembers == alone.num_endmembers
+    assert_close(shared.packed, alone.packed, rtol=1e-4, atol=1e-5)
+    assert not shared.packed.requires_grad
+
+
 def test_a_ray_ends_where_no_sample_can_count_any_more(monkeypatch):
     renderer, field = textured(4e-3, 0.9)
     looked_at = []

@@ -13,6 +13,7 @@ Notation: `R` rays, `A` active ones, `M` samples of each that are marched at onc
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from functools import partial
 
 import torch
 from jaxtyping import Float, Int
@@ -20,6 +21,7 @@ from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import RayBundle
+from unmix_plugin.engine.machine import can_work_beside, working_beside
 from unmix_plugin.field import CoefficientField
 from unmix_plugin.operators.compositing import accumulate
 from unmix_plugin.operators.marching import packed_rows
@@ -34,6 +36,8 @@ FEWEST_SAMPLES = 4
 light that gets through those gets through more."""
 SAMPLES_MARCHED = 16
 """Of each ray, before it is known whether light gets behind them."""
+_FEWEST_SHARED = 4096
+"""Rays that two threads share; of fewer each would wait for the other."""
 _DENSER = 2.0
 """How many times denser what follows is taken to be than what was evaluated: most rays have just entered a surface."""
 
@@ -90,6 +94,19 @@ def composite_view(
 def composite(renderer: VolumeRenderer, field: CoefficientField, ray_bundle: RayBundle) -> Coefficients:
     """Coefficients (R, ...) of each ray, few rays at a time in memory: those of `VolumeRenderer.render` but for what
     this module says, in less time."""
+    if len(ray_bundle) < _FEWEST_SHARED or not can_work_beside(ray_bundle.origins.device):
+        return _composite(renderer, field, ray_bundle)
+    half = replace(renderer, rays_per_chunk=max(renderer.rays_per_chunk // 2, 1))
+    with working_beside(partial(_composite, half, field, ray_bundle[::2])) as other:
+        odd = _composite(half, field, ray_bundle[1::2])
+    even = other.result()
+    packed = even.packed.new_empty(len(ray_bundle), even.packed.shape[1])
+    packed[::2], packed[1::2] = even.packed, odd.packed
+    return Coefficients(packed, even.num_endmembers)
+
+
+@torch.no_grad()
+def _composite(renderer: VolumeRenderer, field: CoefficientField, ray_bundle: RayBundle) -> Coefficients:
     found, chunk = _before_any_sky(renderer, field, ray_bundle), renderer.rays_per_chunk
     parts = [field.sky(ray_bundle[first : first + chunk]) for first in range(0, len(ray_bundle), chunk)]
     skies = [sky for sky in parts if sky is not None]

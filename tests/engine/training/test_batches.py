@@ -87,7 +87,7 @@ def test_the_gradient_of_a_step_is_the_mean_of_those_of_its_batches(config):
 def test_a_training_is_the_same_whichever_batch_is_slower_and_wherever_it_was_stopped(config, monkeypatch):
     straight = newest(finished(config).run.path)
     trainer = quiet_trainer(config)
-    for slower in ("MainThread", "unmix-batch"):
+    for slower in ("MainThread", "unmix-beside"):
         with monkeypatch.context() as patch:
             slow_down(patch, trainer.pipeline.model, slower)
             again = newest(finished(config).run.path)
@@ -119,7 +119,7 @@ def test_a_method_that_says_nothing_of_it_has_one_batch_a_step(short_config):
 
 
 @pytest.mark.usefixtures("_two_threads")
-@pytest.mark.parametrize("thread", ["MainThread", "unmix-batch"])
+@pytest.mark.parametrize("thread", ["MainThread", "unmix-beside"])
 def test_what_goes_wrong_in_either_batch_ends_the_step(config, monkeypatch, thread):
     pipeline = quiet_trainer(config).pipeline.train()
     original = type(pipeline.model).get_train_loss_dict

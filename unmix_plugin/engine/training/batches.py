@@ -1,24 +1,22 @@
 """The batches of a training step, and their gradients: usually one batch; on a CPU with several threads two.
 
-Most operations of a step are too small for PyTorch to share them among threads: on two cores a quarter of one was in
-use beside the other. So two batches, each of half of the rays, are worked on at once by half of the threads each. Both
-add their gradients to those of the parameters, in either order the same sum; of more than two it would not be, and a
-training could not be repeated.
+Two batches, each of half of the rays, are worked on at once by half of the threads each. Both add their gradients to
+those of the parameters, in either order the same sum; of more than two it would not be, and a training could not be
+repeated.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from unmix_plugin.engine.configs import place_of
+from unmix_plugin.engine.machine import can_work_beside, working_beside
 from unmix_plugin.engine.model import Model, TrainOutputs
 from unmix_plugin.engine.pipeline import Pipeline
 from unmix_plugin.errors import ConfigError
@@ -41,23 +39,14 @@ def work_on_batches(pipeline: Pipeline, step: int) -> list[BatchResult]:
     Raises:
         ConfigError: the model's losses can't be added up.
     """
-    threads, rays = torch.get_num_threads(), pipeline.datamanager.get_train_rays_per_batch()
-    is_one = min(pipeline.model.batches_at_once, threads, rays) == 1
-    if is_one or pipeline.model.device.type != "cpu":
+    model, rays = pipeline.model, pipeline.datamanager.get_train_rays_per_batch()
+    if min(model.batches_at_once, rays) == 1 or not can_work_beside(model.device):
         (batch,) = pipeline.train_batches(step)
-        return [_gradients(batch, pipeline.model, 1.0)]
-
-    def work(batch: Callable[[], TrainOutputs]) -> BatchResult:
-        with _num_threads(threads // 2):
-            return _gradients(batch, pipeline.model, 0.5)
-
+        return [_gradients(batch, model, 1.0)]
     batches = pipeline.train_batches(step, 2)
-    beside = _worker().submit(work, next(batches))  # while the next is drawn
-    try:
-        own = work(next(batches))
-    finally:
-        other = beside.result()
-    return [other, own]
+    with working_beside(partial(_gradients, next(batches), model, 0.5)) as other:  # while the next is drawn
+        own = _gradients(next(batches), model, 0.5)
+    return [other.result(), own]
 
 
 def _gradients(batch: Callable[[], TrainOutputs], model: Model, share: float) -> BatchResult:
@@ -67,23 +56,6 @@ def _gradients(batch: Callable[[], TrainOutputs], model: Model, share: float) ->
     loss.backward()
     known = {name: value.detach() for name, value in losses.items()}
     return BatchResult(outputs, known, metrics, loss.detach())
-
-
-@cache
-def _worker() -> ThreadPoolExecutor:
-    """The thread that works beside the one that trains."""
-    return ThreadPoolExecutor(1, thread_name_prefix="unmix-batch")
-
-
-@contextmanager
-def _num_threads(count: int) -> Iterator[None]:
-    """Context in which the operations that this thread calls are shared among so many threads."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def mean_values(batches: Sequence[BatchResult]) -> dict[str, Tensor]:
