@@ -7,6 +7,7 @@ import torch
 from torch.testing import assert_close
 
 from tests.factories.scenes import make_scene
+from tests.factories.trainings import threads
 from tests.poses.test_training import config_for, trained
 from tests.rendering.test_renderer import make, rays
 from tests.rendering.test_unbounded import make as make_unbounded
@@ -60,11 +61,8 @@ def test_two_threads_that_share_a_view_find_what_one_does():
     renderer, field = textured(4e-3, 0.3)
     bundle = rays(5001)
     alone = composite(renderer, field, bundle)
-    torch.set_num_threads(2)
-    try:
+    with threads(2):
         shared = composite(renderer, field, bundle)
-    finally:
-        torch.set_num_threads(1)
     assert shared.num_endmembers == alone.num_endmembers
     assert_close(shared.packed, alone.packed, rtol=1e-4, atol=1e-5)
     assert not shared.packed.requires_grad

@@ -12,7 +12,7 @@ import torch
 from torch.testing import assert_close
 
 from tests.factories.models import CONFIG
-from tests.factories.trainings import finished, newest, quiet_trainer, stop_at
+from tests.factories.trainings import finished, newest, quiet_trainer, stop_at, threads
 from unmix_plugin.engine.configs import PipelineConfig, TrainerConfig
 from unmix_plugin.engine.model import Model
 from unmix_plugin.engine.runs.load_run import load_config
@@ -26,9 +26,8 @@ from unmix_plugin.settings import HyperspectralDataManagerConfig
 
 @pytest.fixture
 def _two_threads() -> Iterator[None]:
-    torch.set_num_threads(2)
-    yield
-    torch.set_num_threads(1)
+    with threads(2):
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -16,6 +16,7 @@ from tests.factories.commands import done, picture_size, refused, run
 from tests.factories.objects import SMALL, trained_on, write_light, write_object, write_spectral_object
 from tests.factories.surfaces import generator, unit
 from tests.factories.systems import needs_xatlas
+from tests.factories.trainings import threads
 from unmix_plugin.commands.eval import evaluate
 from unmix_plugin.commands.export import export
 from unmix_plugin.commands.render import render
@@ -81,12 +82,14 @@ def test_evaluation_finds_colour_and_light_again_also_under_a_light_never_seen(t
         assert picture_size(trained / "eval" / picture) == (1058, 546)
 
 
-def test_a_resumed_run_ends_where_a_straight_one_does(tmp_path):
-    straight = trained_on(write_object(tmp_path / "ball"), PBR, "--steps-per-save=3", steps=6)
-    begun = shutil.copytree(straight, tmp_path / "begun")
-    for path in begun.glob("checkpoints/step-000006*"):
-        path.unlink()
-    done(train, "neumatex", "--load-run", begun, "--max-num-iterations", 6)
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_resumed_run_ends_where_a_straight_one_does(tmp_path, count):
+    with threads(count):
+        straight = trained_on(write_object(tmp_path / "ball"), PBR, "--steps-per-save=3", steps=6)
+        begun = shutil.copytree(straight, tmp_path / "begun")
+        for path in begun.glob("checkpoints/step-000006*"):
+            path.unlink()
+        done(train, "neumatex", "--load-run", begun, "--max-num-iterations", 6)
     expected, found = (load_model(path, "cpu").model.state_dict() for path in (straight, begun))
     assert all(torch.equal(expected[name], found[name]) for name in expected)
 

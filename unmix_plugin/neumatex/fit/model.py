@@ -44,6 +44,7 @@ _START_SEED = 0
 class NeumatexModel(Model):
     """Triplane, family of materials, tone curve; mesh and environment as buffers."""
 
+    batches_at_once = 2
     config: NeumatexModelConfig
 
     def populate_modules(self) -> None:
