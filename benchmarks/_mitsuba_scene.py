@@ -1,4 +1,4 @@
-"""The scene of `neumatex_tracer` for Mitsuba 3."""
+"""The scene of `neumatex_tracer` for Mitsuba 3, and lights and cameras of ours as Mitsuba has them."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ class Scene:
             {
                 "type": "scene",
                 "mesh": {"type": "ply", "filename": str(folder / "mesh.ply"), "bsdf": _material(parameters)},
-                "light": self._light(light),
-                "sensor": self._sensor(cameras),
+                "light": environment_light(mitsuba, light),
+                "sensor": sensor(mitsuba, cameras),
             }
         )
 
@@ -57,41 +57,43 @@ class Scene:
         image = self._mitsuba.render(self._scene, integrator=integrator, spp=paths, seed=3)
         return np.array(image)[..., :3].astype(np.float64), time.process_time() - started
 
-    def _light(self, light: Environment) -> dict[str, Any]:
-        """The environment, with rows and axes as Mitsuba places them."""
-        # Its first and last row lie at the poles, its y axis is up, and it looks along -z at the middle.
-        rows, columns = _ENVIRONMENT_ROWS, 2 * _ENVIRONMENT_ROWS
-        polar = torch.linspace(0, math.pi, rows, dtype=torch.float64)
-        azimuth = 2 * math.pi * (0.5 - (torch.arange(columns, dtype=torch.float64) + 0.5) / columns)
-        polar, azimuth = torch.meshgrid(polar, azimuth, indexing="ij")
-        flat = polar.sin()
-        directions = torch.stack([flat * azimuth.cos(), flat * azimuth.sin(), polar.cos()], dim=-1)
-        radiance = light.radiance(directions.reshape(-1, 3).float()).reshape(rows, columns, 3)
-        to_world = np.array([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])
-        return {
-            "type": "envmap",
-            "bitmap": self._mitsuba.Bitmap(radiance.numpy()),
-            "to_world": self._mitsuba.ScalarTransform4f(to_world),
-        }
 
-    def _sensor(self, cameras: Cameras) -> dict[str, Any]:
-        pose = cameras.camera_to_world[0].double().numpy()
-        origin, up, back = pose[:, 3], pose[:, 1], pose[:, 2]
-        focal = float(cameras.focal_px[0, 0])
-        look_at = self._mitsuba.ScalarTransform4f().look_at(
-            origin.tolist(), (origin - back).tolist(), up.tolist()
-        )
-        return {
-            "type": "perspective",
-            "fov": math.degrees(2 * math.atan(cameras.width / 2 / focal)),
-            "to_world": look_at,
-            "film": {
-                "type": "hdrfilm",
-                "width": cameras.width,
-                "height": cameras.height,
-                "rfilter": {"type": "box"},
-            },
-        }
+def environment_light(mitsuba: Any, light: Environment) -> dict[str, Any]:
+    """An environment of three colours, with rows and axes as Mitsuba places them; +z is up in its scene."""
+    # Its first and last row lie at the poles, its y axis is up, and it looks along -z at the middle.
+    rows, columns = _ENVIRONMENT_ROWS, 2 * _ENVIRONMENT_ROWS
+    polar = torch.linspace(0, math.pi, rows, dtype=torch.float64)
+    azimuth = 2 * math.pi * (0.5 - (torch.arange(columns, dtype=torch.float64) + 0.5) / columns)
+    polar, azimuth = torch.meshgrid(polar, azimuth, indexing="ij")
+    flat = polar.sin()
+    directions = torch.stack([flat * azimuth.cos(), flat * azimuth.sin(), polar.cos()], dim=-1)
+    radiance = light.radiance(directions.reshape(-1, 3).float()).reshape(rows, columns, 3)
+    to_world = np.array([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])
+    return {
+        "type": "envmap",
+        "bitmap": mitsuba.Bitmap(radiance.numpy()),
+        "to_world": mitsuba.ScalarTransform4f(to_world),
+    }
+
+
+def sensor(mitsuba: Any, cameras: Cameras) -> dict[str, Any]:
+    """The first camera, whose centre has to be that of its picture; with alpha."""
+    pose = cameras.camera_to_world[0].double().numpy()
+    origin, up, back = pose[:, 3], pose[:, 1], pose[:, 2]
+    focal = float(cameras.focal_px[0, 0])
+    look_at = mitsuba.ScalarTransform4f().look_at(origin.tolist(), (origin - back).tolist(), up.tolist())
+    return {
+        "type": "perspective",
+        "fov": math.degrees(2 * math.atan(cameras.width / 2 / focal)),
+        "to_world": look_at,
+        "film": {
+            "type": "hdrfilm",
+            "width": cameras.width,
+            "height": cameras.height,
+            "pixel_format": "rgba",
+            "rfilter": {"type": "box"},
+        },
+    }
 
 
 def _material(parameters: list[float]) -> dict[str, Any]:
