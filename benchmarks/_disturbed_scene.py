@@ -43,9 +43,7 @@ def write_lit_by_camera(source: Path, target: Path) -> Path:
     """The scene with a lamp that keeps its place beside the camera, in all views; size and bands as in the source."""
     from unmix_plugin.scenes.demo.scene import demo_cameras, frame_name, radiance_cube
     from unmix_plugin.scenes.demo.shading import (
-        _LAMP_POSITION as LAMP_POSITION,
-    )
-    from unmix_plugin.scenes.demo.shading import (
+        LAMP_POSITION,
         band_centers_nm,
         lamp_power,
         reflectances,

@@ -136,7 +136,7 @@ def make_ring(capture: Path) -> None:
     from unmix_plugin.captures import demo
     from unmix_plugin.engine.geometry.camera_paths import upright_cameras
     from unmix_plugin.scenes.demo.scene import Place, demo_cameras
-    from unmix_plugin.scenes.demo.shading import _LAMP_POSITION, render_view
+    from unmix_plugin.scenes.demo.shading import LAMP_POSITION, render_view
 
     def ring(size: int, views: int) -> Any:
         turn, up = 2 * np.pi * np.arange(views) / views, np.radians(RING_ELEVATION_DEG)
@@ -149,7 +149,7 @@ def make_ring(capture: Path) -> None:
 
     def lit_from_beside(cameras: Any, index: int, things: Any) -> Any:
         turn = 2 * np.pi * index / len(cameras)
-        x, y, z = _LAMP_POSITION
+        x, y, z = LAMP_POSITION
         lamp = (x * np.cos(turn) - y * np.sin(turn), x * np.sin(turn) + y * np.cos(turn), z)
         return render_view(cameras, index, things=things, lamp=lamp)
 

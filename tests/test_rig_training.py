@@ -80,7 +80,8 @@ def test_every_loss_works_on_every_sensor_and_pixels_of_few_channels_are_not_unm
     model = make_model(losses=LossConfig(abundances=0.5)).train()
     rays, pixels = make_batch()
     opaque = [replace(own, alpha=torch.ones(len(own))) for own in pixels]
-    _, losses, metrics = model.get_train_loss_dict(rays, to_batch(opaque))
+    outputs, losses, metrics = model.get_train_loss_dict(rays, to_batch(opaque))
+    model.update(outputs)
     assert {"spectral", "rgb", "abundances"} <= losses.keys()
     assert all(loss.isfinite() and loss > 0 for loss in losses.values())
     assert metrics["psnr"].isfinite()

@@ -85,3 +85,11 @@ def test_corrected_p_is_that_of_benjamini_and_hochberg():
     p = np.random.default_rng(0).uniform(size=50) ** 2
     np.testing.assert_allclose(adjusted(p), false_discovery_control(p))
     assert np.isnan(adjusted(np.array([0.1, np.nan]))).tolist() == [False, True]
+
+
+def test_what_rounding_leaves_of_a_run_beside_itself_is_no_change():
+    generator = np.random.default_rng(0)
+    rounding = np.where(generator.random(2000) < 0.1, 1e-7 * generator.normal(size=2000), 0.0)
+    found = difference_of_heights(rounding, generator.normal(size=(2000, 1)))
+    assert not is_significant(found.q, 0.05).any()
+    assert (found.error > 0.001).all()

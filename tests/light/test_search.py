@@ -8,7 +8,7 @@ from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.light import search as lamp_search
 from unmix_plugin.light.search import _best_lamp, _LampEvidence, _turning_axis, find_lamp
 from unmix_plugin.scenes.demo.scene import _LOOK_AT, demo_cameras
-from unmix_plugin.scenes.demo.shading import _LAMP_POSITION, render_view
+from unmix_plugin.scenes.demo.shading import LAMP_POSITION, render_view
 from unmix_plugin.scenes.geometry.carving import carve_box
 from unmix_plugin.scenes.geometry.lighting import local_log_brightness, seen_places
 
@@ -40,7 +40,7 @@ def test_things_on_a_table_tell_in_which_frame_the_lamp_stands():
     for index in range(24):
         x, y = cameras.camera_to_world[index, :2, 3].tolist()
         turn = np.array([[x, -y], [y, x]]) / np.hypot(x, y)
-        lamp = (*(turn @ _LAMP_POSITION[:2]).tolist(), _LAMP_POSITION[2])
+        lamp = (*(turn @ LAMP_POSITION[:2]).tolist(), LAMP_POSITION[2])
         view = render_view(cameras, index, subpixels=1, lamp=lamp)
         shading.append(local_log_brightness(torch.from_numpy(view.diffuse.sum(axis=-1)).float()))
         matter.append(view.alpha > 0)
@@ -48,7 +48,7 @@ def test_things_on_a_table_tell_in_which_frame_the_lamp_stands():
     hull = carve_box(cameras, matter, box, 64)
     evidence = _LampEvidence(cameras, *seen_places(cameras, shading, hull, box), hull, box)
     found = _best_lamp(evidence, cameras)[1]
-    true = np.array([_LAMP_POSITION[1], _LAMP_POSITION[2] - _LOOK_AT[2], _LAMP_POSITION[0]])
+    true = np.array([LAMP_POSITION[1], LAMP_POSITION[2] - _LOOK_AT[2], LAMP_POSITION[0]])
     cosine = np.dot(found.place, true) / np.linalg.norm(found.place) / np.linalg.norm(true)
     assert found.frame == "turntable"
     assert np.degrees(np.arccos(cosine)) < 20

@@ -205,9 +205,9 @@ def difference_of_heights(
     inner, outer = np.quantile(ratios, _INNER), np.quantile(ratios, _OUTER)
     spreads = [stats.t.ppf((1 + _OUTER) / 2, n) / stats.t.ppf((1 + _INNER) / 2, n) for n in _DEGREES]
     degrees = _DEGREES[int(np.argmin(np.abs(np.array(spreads) - outer / max(inner, 1e-12))))]
-    scale = max(float(inner / stats.t.ppf((1 + _INNER) / 2, degrees)), 1e-12)
-    p[known] = 2 * stats.t.sf(ratios / scale, degrees)
-    error[known] = usual * scale
+    # Of a run beside itself, nearly all distances are 0 and what rounding leaves would stand out.
+    error[known] = (usual * inner / stats.t.ppf((1 + _INNER) / 2, degrees)).clip(min=_LEAST_DISTANCE)
+    p[known] = 2 * stats.t.sf(np.abs(change[known]) / error[known], degrees)
     return Difference(np.where(known, change, np.nan)[:, None], error[:, None], p, 1.0)
 
 
