@@ -352,8 +352,7 @@ def judge_floors(folder: Path, floors: Sequence[tuple[str, np.ndarray]]) -> Iter
     """Whether true poses are called wrong."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, texture in floors:
-        views, findings = _floor_views(folder, texture), list[str]()
-        check_matches(MatchedScene.of(views), findings)
+        findings = check_matches(MatchedScene.of(_floor_views(folder, texture)))
         outcome = "do not fit" if findings else "no finding"
         yield _row(f"floor, {name}", "patterns that repeat", "matches", outcome, "no finding")
 
