@@ -30,6 +30,7 @@ from scipy import ndimage
 from unmix_plugin.captures.match_checks import MatchedScene, check_matches
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.pose_set import PosedCamera
+from unmix_plugin.captures.report import Code
 from unmix_plugin.commands.train import parse
 from unmix_plugin.engine.decisions import UNDECIDED
 from unmix_plugin.engine.geometry.camera_paths import upright_cameras
@@ -352,8 +353,9 @@ def judge_floors(folder: Path, floors: Sequence[tuple[str, np.ndarray]]) -> Iter
     """Whether true poses are called wrong."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, texture in floors:
-        findings = check_matches(MatchedScene.of(_floor_views(folder, texture)))
-        outcome = "do not fit" if findings else "no finding"
+        codes = {remark.code for remark in check_matches(MatchedScene.of(_floor_views(folder, texture)))}
+        is_found = not codes.isdisjoint({Code.LENS_MISFITS, Code.POSES_MISFIT})
+        outcome = "do not fit" if is_found else "no finding"
         yield _row(f"floor, {name}", "patterns that repeat", "matches", outcome, "no finding")
 
 
