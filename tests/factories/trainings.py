@@ -2,13 +2,11 @@
 
 import io
 import signal
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 from rich.console import Console
 
 from unmix_plugin.engine.configs import TrainerConfig
@@ -40,17 +38,6 @@ def stop_at(config: TrainerConfig, step: int, number: int = signal.SIGINT) -> In
     with pytest.raises(Interrupted) as caught:
         trainer.train()
     return caught.value
-
-
-@contextmanager
-def threads(count: int) -> Iterator[None]:
-    """Context in which tensors are computed by so many threads; in tests it is one."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def newest(run: Path) -> Checkpoint:

@@ -7,11 +7,11 @@ import torch
 from torch.testing import assert_close
 
 from tests.factories.scenes import make_scene
-from tests.factories.trainings import threads
 from tests.poses.test_training import config_for, trained
 from tests.rendering.test_renderer import make, rays
 from tests.rendering.test_unbounded import make as make_unbounded
 from tests.rendering.test_unbounded import rays as rays_without_end
+from unmix_plugin.engine.machine import operations_shared_among
 from unmix_plugin.presets import WITH_ALPHA
 from unmix_plugin.rendering import front_to_back
 from unmix_plugin.rendering.front_to_back import composite
@@ -61,7 +61,7 @@ def test_two_threads_that_share_a_view_find_what_one_does():
     renderer, field = textured(4e-3, 0.3)
     bundle = rays(5001)
     alone = composite(renderer, field, bundle)
-    with threads(2):
+    with operations_shared_among(2):
         shared = composite(renderer, field, bundle)
     assert shared.num_endmembers == alone.num_endmembers
     assert_close(shared.packed, alone.packed, rtol=1e-4, atol=1e-5)

@@ -97,10 +97,10 @@ def working_beside(call: Callable[[], _T]) -> Iterator[Future[_T]]:
     threads = torch.get_num_threads() // 2
 
     def work() -> _T:
-        with _operations_shared_among(threads):
+        with operations_shared_among(threads):
             return call()
 
-    with _operations_shared_among(threads):
+    with operations_shared_among(threads):
         beside = _threads_beside().submit(work)
         try:
             yield beside
@@ -114,7 +114,8 @@ def _threads_beside() -> ThreadPoolExecutor:
 
 
 @contextmanager
-def _operations_shared_among(num_threads: int) -> Iterator[None]:
+def operations_shared_among(num_threads: int) -> Iterator[None]:
+    """Context in which PyTorch shares the operations that this thread calls among so many threads."""
     before = torch.get_num_threads()
     torch.set_num_threads(num_threads)
     try:

@@ -12,8 +12,9 @@ import torch
 from torch.testing import assert_close
 
 from tests.factories.models import CONFIG
-from tests.factories.trainings import finished, newest, quiet_trainer, stop_at, threads
+from tests.factories.trainings import finished, newest, quiet_trainer, stop_at
 from unmix_plugin.engine.configs import PipelineConfig, TrainerConfig
+from unmix_plugin.engine.machine import operations_shared_among
 from unmix_plugin.engine.model import Model
 from unmix_plugin.engine.runs.load_run import load_config
 from unmix_plugin.engine.training.batches import work_on_batches
@@ -26,7 +27,7 @@ from unmix_plugin.settings import HyperspectralDataManagerConfig
 
 @pytest.fixture
 def _two_threads() -> Iterator[None]:
-    with threads(2):
+    with operations_shared_among(2):
         yield
 
 

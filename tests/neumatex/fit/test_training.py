@@ -16,12 +16,12 @@ from tests.factories.commands import done, picture_size, refused, run
 from tests.factories.objects import SMALL, trained_on, write_light, write_object, write_spectral_object
 from tests.factories.surfaces import generator, unit
 from tests.factories.systems import needs_xatlas
-from tests.factories.trainings import threads
 from unmix_plugin.commands.eval import evaluate
 from unmix_plugin.commands.export import export
 from unmix_plugin.commands.render import render
 from unmix_plugin.commands.train import train
 from unmix_plugin.engine import PipelineConfig, load_model
+from unmix_plugin.engine.machine import operations_shared_among
 from unmix_plugin.neumatex.export import pbr_fit
 from unmix_plugin.neumatex.export.material import material_paths
 from unmix_plugin.neumatex.fit import start
@@ -84,7 +84,7 @@ def test_evaluation_finds_colour_and_light_again_also_under_a_light_never_seen(t
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_a_resumed_run_ends_where_a_straight_one_does(tmp_path, count):
-    with threads(count):
+    with operations_shared_among(count):
         straight = trained_on(write_object(tmp_path / "ball"), PBR, "--steps-per-save=3", steps=6)
         begun = shutil.copytree(straight, tmp_path / "begun")
         for path in begun.glob("checkpoints/step-000006*"):
