@@ -3,9 +3,8 @@
 Cameras agree on distances better than on densities: of each point of a grid the signed distance to what they see is
 averaged, and the surface is where it is 0. What no camera looks into counts as solid, so that the mesh is closed and
 has no inner sides; what no camera sees of it was never learnt, and is cut away unless asked for. Kept, it closes a
-solid, which no camera alone looks into. Of short trainings it
-is several times nearer to the truth than a surface of equal density, and much smoother, but rounds what is thinner than
-a pixel.
+solid, which no camera alone looks into. Of short trainings it is several times nearer to the truth than a surface of
+equal density, and much smoother, but rounds what is thinner than a pixel.
 
 Notation: `V` vertices, `F` faces.
 """
@@ -15,7 +14,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from functools import partial
 from typing import TypeAlias
 
 import numpy as np
@@ -142,7 +140,7 @@ def surface_of(
     grid = GridPoints.over(
         scene.scene_box.aabb, int(np.clip(round(across), *_CELLS)) if resolution is None else resolution
     )
-    distances = _distances_on(grid, partial(seen.signed_distance, is_closed=keeps_unseen), scene, follow)
+    distances = _distances_on(grid, seen, scene, follow, is_closed=keeps_unseen)
     with working("finding the surface"):
         # Past an outline distances jump, and a blur of the whole jump would move the surface inwards.
         most = max(1.0, grid.cell / scene.pixel_size)
@@ -183,12 +181,8 @@ def surface_of(
     return mesh, unseen
 
 
-SignedDistance: TypeAlias = Callable[[Float[torch.Tensor, "P 3"], float], Float[torch.Tensor, " P"]]
-"""`SeenSurface.signed_distance`."""
-
-
 def _distances_on(
-    grid: GridPoints, signed_distance: SignedDistance, scene: TrainedScene, follow: Follow
+    grid: GridPoints, seen: SeenSurface, scene: TrainedScene, follow: Follow, *, is_closed: bool
 ) -> Float32[np.ndarray, "X Y Z"]:
     """Signed distances at the points of a grid, pixels, up to the reach: measured near the surface, elsewhere
     interpolated from a coarse grid."""
@@ -197,7 +191,8 @@ def _distances_on(
     coarse = GridPoints.over(scene.scene_box.aabb, max(8, (max(grid.shape) - 1) // _COARSER))
     reach, wide = (max(_REACH_PX, _REACH_CELLS * one.cell / scene.pixel_size) for one in (grid, coarse))
     slices = [
-        signed_distance(coarse.slice_points(index).flatten(0, 1), wide) for index in range(coarse.shape[0])
+        seen.signed_distance(coarse.slice_points(index).flatten(0, 1), wide, is_closed)
+        for index in range(coarse.shape[0])
     ]
     first = torch.stack(slices).view(coarse.shape).numpy()
     found = []
@@ -208,7 +203,7 @@ def _distances_on(
         )
         near = np.abs(parts) < _NEAR
         parts = (parts * (wide / reach)).clip(-1, 1)
-        parts[near] = signed_distance(points[torch.from_numpy(near)], reach).numpy()
+        parts[near] = seen.signed_distance(points[torch.from_numpy(near)], reach, is_closed).numpy()
         found.append(reach * parts.reshape(grid.shape[1:]))
     return np.stack(found)
 

@@ -7,6 +7,7 @@ repeated.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -27,8 +28,8 @@ class BatchResult:
     """What a batch gave, whose gradients were added to those of the parameters."""
 
     outputs: dict[str, Any]
-    losses: dict[str, Tensor]
-    metrics: dict[str, Tensor]
+    values: dict[str, Tensor]
+    """Losses and metrics without their graphs."""
     loss: Tensor
     """What of the step's loss is this batch's, without its graph."""
 
@@ -54,16 +55,17 @@ def _gradients(batch: Callable[[], TrainOutputs], model: Model, share: float) ->
     require_losses(losses, type(model))
     loss = share * torch.stack([loss.reshape(()) for loss in losses.values()]).sum()
     loss.backward()
-    known = {name: value.detach() for name, value in losses.items()}
-    return BatchResult(outputs, known, metrics, loss.detach())
+    values = {name: value.detach() for name, value in {**losses, **metrics}.items()}
+    return BatchResult(outputs, values, loss.detach())
 
 
 def mean_values(batches: Sequence[BatchResult]) -> dict[str, Tensor]:
     """Losses and metrics by name, each the mean over the batches that have it."""
-    found = [{**batch.losses, **batch.metrics} for batch in batches]
-    names = dict.fromkeys(name for values in found for name in values)
-    values = {name: [each[name].detach() for each in found if name in each] for name in names}
-    return {name: torch.stack(own).mean(dim=0) for name, own in values.items()}
+    found: dict[str, list[Tensor]] = defaultdict(list)
+    for batch in batches:
+        for name, value in batch.values.items():
+            found[name].append(value)
+    return {name: torch.stack(own).mean(dim=0) for name, own in found.items()}
 
 
 def require_losses(losses: Mapping[str, Any], kind: type) -> None:
