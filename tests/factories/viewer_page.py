@@ -97,6 +97,11 @@ class Page:
         """Change a control, or press a button."""
         self.send("GuiUpdateMessage", uuid=self.control(label), updates={"value": value})
 
+    def set_all(self, values: dict[str, Any]) -> None:
+        """Change several, given by their labels."""
+        for label, value in values.items():
+            self.set(label, value)
+
     def send(self, kind: str, **content: Any) -> None:
         self._socket.send(msgspec.msgpack.encode({"type": kind, **content}))
 

@@ -28,7 +28,7 @@ def source(tmp_path):
 
 def finished(page, viewer):
     """Wait for the last estimate of the finest picture; its colours."""
-    (session,) = viewer._sessions.values()
+    (session,) = viewer.sessions
     view = session.view
 
     def is_finished():
@@ -84,7 +84,7 @@ def test_light_is_exchanged_and_turned_for_this_page_alone_and_kept_when_it_is_l
         before = finished(page, viewer)["linear_rgb"]
         page.set("environment", "studio")
         page.set("turned by (deg)", 90)
-        (session,) = viewer._sessions.values()
+        (session,) = viewer.sessions
         page.wait_until(lambda: session.view.frame_edit.light.rotation_deg == 90)
         relit = finished(page, viewer)["linear_rgb"]
         assert float((relit - before).abs().mean()) > 0.1 * float(before.mean())
@@ -103,7 +103,7 @@ def test_a_click_reads_the_numbers_of_the_light_that_is_shown(source):
     with serving(source) as (viewer, _), opened(viewer, rows=48) as page:
         page.set("environment", light.name)
         page.set("brightness (stops)", light.exposure_stops)
-        (session,) = viewer._sessions.values()
+        (session,) = viewer.sessions
         page.wait_until(lambda: session.view.edit.light == light)
         page.click(0.5, 0.5)
         page.wait_until(lambda: "linear_rgb" in page.texts)
@@ -123,7 +123,7 @@ def test_the_strips_of_a_screenshot_have_the_scale_of_the_picture_on_screen(sour
     with serving(source) as (viewer, _), opened(viewer, rows=48) as page:
         show_layer(page, "depth")
         finished(page, viewer)
-        (session,) = viewer._sessions.values()
+        (session,) = viewer.sessions
         page.set("width", 32)
         page.set("height", 24)
         page.set("save a screenshot (PNG)", True)

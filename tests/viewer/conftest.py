@@ -41,7 +41,7 @@ def shared_viewer(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Viewer]:
 def viewer(shared_viewer: Viewer) -> Viewer:
     """The same without the pages and the files of the tests before."""
     until = time.monotonic() + 60
-    while shared_viewer.num_clients:
+    while shared_viewer.sessions:
         assert time.monotonic() < until
         time.sleep(0.01)
     for folder in (shared_viewer.services.folder, shared_viewer.services.recipes_folder):

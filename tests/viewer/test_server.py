@@ -218,7 +218,7 @@ def test_a_page_must_give_the_token_before_it_sees_anything(guarded):
     assert (status, "asks for the token" in text, '<div id="root">' in text) == (401, True, False)
     assert read(guarded, coded("barley"))[0] == 401
     assert refused(guarded) == refused(guarded, headers=coded("barley")) == 401
-    assert guarded.num_clients == 0
+    assert guarded.sessions == ()
     status, headers, _ = read(guarded, coded("sesame"))
     assert status == 200
     cookie = {"Cookie": headers["Set-Cookie"].partition(";")[0]}

@@ -41,7 +41,7 @@ def test_a_reload_keeps_camera_layer_and_edits_and_another_browser_starts_anew(v
         time.sleep(0.5)  # the edit can reach the picture after the layer
         before = decoded(page.last_picture)
     until = time.monotonic() + 60
-    while viewer.num_clients:
+    while viewer.sessions:
         assert time.monotonic() < until
         time.sleep(0.01)
     with page_of(viewer, storage=storage) as page:

@@ -197,7 +197,7 @@ def _shown(trainer: Trainer, viewing: TrainingViewerOptions, console: Console) -
     viewer.start()
     try:
         yield
-        if viewing.keep_open or viewer.num_clients:
+        if viewing.keep_open or viewer.sessions:
             until = "" if viewing.keep_open else " while a page is"
             say(console, f"training is done, the viewer stays open{until}; end it with Ctrl-C")
             with suppress(KeyboardInterrupt):

@@ -137,9 +137,10 @@ class Viewer:
             self._ticker.join()
 
     @property
-    def num_clients(self) -> int:
-        """Pages that are served."""
-        return len(self._sessions)
+    def sessions(self) -> tuple[Session, ...]:
+        """Of the pages that are served."""
+        with self._lock:
+            return tuple(self._sessions.values())
 
     def wait(self, while_watched: bool = False) -> None:
         """Serve until Ctrl-C, SIGTERM or SIGHUP, which raise KeyboardInterrupt, or until stopped by another thread;
@@ -182,7 +183,7 @@ class Viewer:
         while not self._stopped.wait(_TICK_S):
             with reporting_failures("panels could not be renewed", self._say):
                 self.services.tick()
-                for session in list(self._sessions.values()):
+                for session in self.sessions:
                     session.tick()
 
 
