@@ -45,6 +45,8 @@ class Page:
     downloads: list[str] = field(default_factory=list)
     frusta: dict[str, bool] = field(default_factory=dict)
     """Whether each camera that is shown has its image."""
+    kinds: set[str] = field(default_factory=set)
+    """Of all messages that came."""
     is_closed: bool = False
     storage: dict[str, str] = field(default_factory=dict)
     """What the browser keeps from page to page."""
@@ -146,6 +148,7 @@ class Page:
 
     def _take(self, message: dict[str, Any]) -> None:
         kind = message["type"]
+        self.kinds.add(kind)
         if kind == "BackgroundImageMessage" and message["rgb_data"] is not None:
             self.last_picture, self.last_depth = message["rgb_data"], message["depth_data"]
             self.pictures.append((time.monotonic(), len(message["rgb_data"])))

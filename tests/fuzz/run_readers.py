@@ -34,7 +34,7 @@ from unmix_plugin.settings import SceneOptions
 from unmix_plugin.trained.measures import read_measures
 from unmix_plugin.trained.regions import Box, OfMaterial, region_to_json
 from unmix_plugin.trained.run_views import recorded_views, world_frame
-from unmix_plugin.viewer.connections import _is_heard
+from unmix_plugin.viewer.connections import is_heard
 
 
 def _json_reader(
@@ -190,5 +190,5 @@ def viewer_message_reader() -> Reader:
 
 def _read_message(data: bytes) -> None:
     """What the viewer listens to is a message that viser reads."""
-    if _is_heard(data):
+    if is_heard(data):
         Message.deserialize(data)

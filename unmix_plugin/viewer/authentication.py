@@ -27,16 +27,23 @@ ANYWHERE = ("0.0.0.0", "::", "")
 MOST_PAGES = 16
 """Pages that are served at once."""
 
-_GUESS_S = 0.5
-"""Time between two guesses of the token, of all addresses together, so that nobody gets through a dictionary."""
-
 _MOST_WAITING, _MOST_WAITING_IN_ALL = 16, 64
 """Guesses that may wait for their turn at once: from one address, and from all of them."""
 
-_ROOM_S = 2.0
-"""How long a page waits for a place: one that is loaded again comes before its old connection has gone."""
+_MOST_KINDS, _LONGEST_WARNING = 16, 400
 
-_MOST_SITES_NAMED = 16
+
+class WarningsOfStrangers:
+    """Warnings that strangers cause: one of each kind, few kinds in all, none long, or they would fill the disk."""
+
+    def __init__(self, say: Callable[[str], None]) -> None:
+        self._say, self._kinds = say, set[str]()
+
+    def warn(self, kind: str, text: str) -> None:
+        """Say a line, unless one of its kind was said."""
+        if kind not in self._kinds and len(self._kinds) < _MOST_KINDS:
+            self._kinds.add(kind)
+            self._say(f"warning: {text}"[:_LONGEST_WARNING])
 
 
 @dataclass(frozen=True)
@@ -49,10 +56,11 @@ class _Refusal:
 
 
 class _GuessQueue:
-    """Guesses of the token, one every `_GUESS_S`: each address that guesses has its turn before one of them has
+    """Guesses of the token, one every `guess_s`: each address that guesses has its turn before one of them has
     another, so that a crowd of guesses from one address does not keep the owner out."""
 
-    def __init__(self) -> None:
+    def __init__(self, guess_s: float) -> None:
+        self._guess_s = guess_s
         self._waiting: list[tuple[int, str, object]] = []
         """In which round each guess has its turn, and the network that it comes from."""
         self._round, self._next_at = 0, 0.0
@@ -66,14 +74,14 @@ class _GuessQueue:
         mine = (max([self._round, *rounds]) + 1, network, object())
         self._waiting.append(mine)
         if self._waiting == [mine]:
-            self._next_at = max(self._next_at, time.monotonic() + _GUESS_S)
+            self._next_at = max(self._next_at, time.monotonic() + self._guess_s)
         try:
             # The first of the least round; Python's min takes the first of equals.
             while min(self._waiting, key=lambda one: one[0]) is not mine or time.monotonic() < self._next_at:
-                await asyncio.sleep(_GUESS_S / 10)
+                await asyncio.sleep(self._guess_s / 10)
         finally:
             self._waiting.remove(mine)
-        self._round, self._next_at = mine[0], time.monotonic() + _GUESS_S
+        self._round, self._next_at = mine[0], time.monotonic() + self._guess_s
         return True
 
 
@@ -89,14 +97,23 @@ def _network_of(address: str) -> str:
 class Authentication:
     """Judges requests and counts pages; used by the server's event loop alone."""
 
-    def __init__(self, host: str, token: str | None, say: Callable[[str], None] = lambda _: None) -> None:
-        """`host` is where the server listens."""
-        self._host, self._say = host, say
+    def __init__(
+        self,
+        host: str,
+        token: str | None,
+        say: Callable[[str], None] = lambda _: None,
+        *,
+        guess_s: float = 0.5,
+        room_s: float = 2.0,
+    ) -> None:
+        """`host` is where the server listens; `guess_s` are seconds between two guesses of the token, of all addresses
+        together, so that nobody gets through a dictionary; `room_s` is how long a page waits for a place: one that is
+        loaded again comes before its old connection has gone."""
+        self._host, self._warnings = host, WarningsOfStrangers(say)
         self._token = None if token is None else token.encode()
         self._cookie_value = secrets.token_urlsafe(32)
         self._pages: set[Hashable] = set()
-        self._sites_warned_of: set[str] = set()
-        self._guesses = _GuessQueue()
+        self._guesses, self._room_s = _GuessQueue(guess_s), room_s
 
     async def refusal(
         self, page: Hashable, headers: Mapping[str, str], address: str, port: int
@@ -153,17 +170,16 @@ class Authentication:
 
     def _foreign(self, site: str, opens: bool) -> _Refusal:
         site = "".join(character for character in site[:100] if character.isprintable())
-        if site not in self._sites_warned_of and len(self._sites_warned_of) < _MOST_SITES_NAMED:
-            self._sites_warned_of.add(site)
-            self._say(
-                f"warning: a page of another site ({site}) tried to use the viewer and was refused; if it is yours, "
-                "start the viewer with --viewer.token"
-            )
+        self._warnings.warn(
+            site,
+            f"a page of another site ({site}) tried to use the viewer and was refused; if it is yours, "
+            "start the viewer with --viewer.token",
+        )
         reason = "this page is from another site; the viewer must be started with --viewer.token to serve it"
         return _Refusal(HTTPStatus.FORBIDDEN, reason if opens else _page(reason), _HTML)
 
     async def _has_room(self, page: Hashable, opens: bool) -> bool:
-        until = time.monotonic() + _ROOM_S
+        until = time.monotonic() + self._room_s
         while len(self._pages) >= MOST_PAGES:
             if time.monotonic() > until:
                 return False

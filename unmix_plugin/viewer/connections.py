@@ -17,6 +17,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from html import escape
 from http import HTTPStatus
@@ -29,7 +30,7 @@ from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.viewer.authentication import Authentication
+from unmix_plugin.viewer.authentication import Authentication, WarningsOfStrangers
 
 LABEL = "unmix-nerf"
 
@@ -65,18 +66,11 @@ _LARGEST_MESSAGE = 1 << 16
 _MOST_FRAGMENTS = 64
 """Of one message; browsers send one."""
 
-_MESSAGES_PER_S, _BYTES_PER_S = 200, 1 << 19
-"""What a page may send for long: browsers send cameras and sliders some tens of times a second."""
-
-_BURST_S = 2.0
-"""How much of that may come at once."""
-
 _SILENT_S = 60.0
 """How long a page may say nothing at first: its browser loads the parts that it draws with."""
 
 _SENDING_S = 0.2
 _LONGEST_FAULT = 200
-_MOST_FAULTS = 16
 
 
 class _Camera(msgspec.Struct, tag="ViewerCameraMessage", tag_field="type"):
@@ -122,7 +116,7 @@ _ANY_DECODER = msgspec.msgpack.Decoder(_Any)
 _KINDS = {kind.__struct_config__.tag for kind in (_Camera, _Update, _Stored, _Pointer)}
 
 
-def _is_heard(data: bytes) -> bool:
+def is_heard(data: bytes) -> bool:
     """Whether a message is one that the viewer listens to; others, such as uploads and requests for a tunnel, are not.
     A ValueError if it is no message of a page."""
     try:
@@ -134,21 +128,40 @@ def _is_heard(data: bytes) -> bool:
     return not isinstance(message, _Update) or set(message.updates) == {"value"}
 
 
+@dataclass
+class RateLimit:
+    """How fast a page may send; browsers send cameras and sliders some tens of times a second."""
+
+    messages_per_s: float = 200.0
+    bytes_per_s: float = 2.0**19
+    burst_s: float = 2.0
+    """How much of that may come at once."""
+    _paid_until: float = 0.0
+
+    def delay(self, size: int, now: float) -> float:
+        """Seconds to wait after a message of so many bytes that came now, before the next is taken."""
+        cost = max(1 / self.messages_per_s, size / self.bytes_per_s)
+        self._paid_until = max(self._paid_until, now - self.burst_s) + cost
+        return max(self._paid_until - now, 0.0)
+
+
 class _Connection(ServerConnection):
     """A page's connection: what comes is bounded in size and pace before anything of it is kept."""
 
     def __init__(self, authentication: Authentication, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self._authentication = authentication
-        self._paid_until, self._has_spoken = 0.0, False
+        self._rate, self._has_spoken = RateLimit(), False
 
     async def recv(self, decode: bool | None = None) -> Any:
         """The next message that the viewer listens to; a page that sends what none sends loses its connection."""
         while True:
             data = await self._next_message()
-            await self._keep_pace(len(data))
+            # While it waits a page that sends too fast can't send either.
+            if delay := self._rate.delay(len(data), time.monotonic()):
+                await asyncio.sleep(delay)
             try:
-                if _is_heard(data):
+                if is_heard(data):
                     return data
             except ValueError:
                 await self.close(1007, "not a message of a page")
@@ -173,14 +186,6 @@ class _Connection(ServerConnection):
             if len(parts) > _MOST_FRAGMENTS:
                 return None
         return b"".join(parts)
-
-    async def _keep_pace(self, size: int) -> None:
-        """Wait where a page sends too fast: it then can't send either."""
-        now = time.monotonic()
-        cost = max(1 / _MESSAGES_PER_S, size / _BYTES_PER_S)
-        self._paid_until = max(self._paid_until, now - _BURST_S) + cost
-        if self._paid_until > now:
-            await asyncio.sleep(self._paid_until - now)
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Give back the page's place."""
@@ -213,7 +218,15 @@ def open_server(
     logger.addHandler(logging.NullHandler())
 
     def serve_guarded(handler: Any, *_address: Any, process_request: Any, **options: Any) -> Any:
-        asyncio.get_running_loop().set_exception_handler(_fault_handler(say))
+        warnings = WarningsOfStrangers(say)  # a traceback of each fault would fill the disk
+
+        def warn(_loop: Any, context: dict[str, Any]) -> None:
+            error = context.get("exception")
+            kind = type(error).__name__ if error else str(context.get("message", ""))[:_LONGEST_FAULT]
+            text = "" if error is None else str(error)[:_LONGEST_FAULT]
+            warnings.warn(kind, f"the viewer could not take something that a page sent ({kind}: {text!r})")
+
+        asyncio.get_running_loop().set_exception_handler(warn)
         guards = {
             "process_request": partial(_answer, authentication, process_request, title),
             "process_response": lambda _connection, _request, response: _with_headers(response, _HEADERS),
@@ -285,21 +298,6 @@ def _with_headers(response: Response, headers: Mapping[str, str]) -> Response:
         response.headers.pop(name, None)
         response.headers[name] = value
     return response
-
-
-def _fault_handler(say: Callable[[str], None]) -> Callable[[Any, dict[str, Any]], None]:
-    """Says what went wrong in handling a message, once for each kind: a traceback for each would fill the disk."""
-    known: set[str] = set()
-
-    def handle(_loop: Any, context: dict[str, Any]) -> None:
-        error = context.get("exception")
-        kind = type(error).__name__ if error else str(context.get("message", ""))[:_LONGEST_FAULT]
-        if kind not in known and len(known) < _MOST_FAULTS:
-            known.add(kind)
-            text = "" if error is None else str(error)[:_LONGEST_FAULT]
-            say(f"warning: the viewer could not take something that a page sent ({kind}: {text!r})")
-
-    return handle
 
 
 def send_what_is_queued(server: viser.ViserServer) -> None:
