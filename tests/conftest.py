@@ -9,6 +9,8 @@ from typing import Any
 import pytest
 from filelock import FileLock
 
+from unmix_plugin.errors import SceneError
+
 
 @pytest.fixture(scope="session")
 def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable[[Path], Any]], Any]:
@@ -25,6 +27,25 @@ def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callab
         return pickle.loads(kept.read_bytes())
 
     return once
+
+
+@pytest.fixture(autouse=True)
+def nothing_judged_before(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch):
+    """Each test judges its scenes itself, unless it asks for what is kept."""
+    if "judged_before" in request.fixturenames:
+        return
+
+    def none():
+        raise SceneError("nothing is kept in tests")
+
+    monkeypatch.setattr("unmix_plugin.scenes.kept.user_cache", none)
+
+
+@pytest.fixture
+def judged_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A cache of its own, in which what is judged of scenes is kept; the folder of the judgements."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return tmp_path / "cache" / "unmix-nerf" / "judged"
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ from unmix_plugin.datamanager import HyperspectralDataManager
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.engine.runs.scene_record import SceneRecord, check_same_scene, scene_record_to_json
 from unmix_plugin.errors import ConfigError, RunError, SceneError
-from unmix_plugin.scenes import pixel_pool, pixel_table
+from unmix_plugin.scenes import judged_views, pixel_pool, pixel_table
 from unmix_plugin.scenes.demo.scene import make_demo_scene
 from unmix_plugin.scenes.evidence import relative_power
 from unmix_plugin.settings import HyperspectralDataManagerConfig, SceneOptions
@@ -319,6 +319,6 @@ def test_light_without_alpha_is_judged_by_the_pixels_that_masks_leave(tmp_path, 
     Image.fromarray(np.tri(height, width) > 0).save(folder.root / "mask.png")
     folder.edit(lambda content: [frame.update(mask_path="mask.png") for frame in content["frames"]])
     asked = []
-    monkeypatch.setattr(datamanager, "find_matched_points", lambda views: asked.append(views.valid(0)))
+    monkeypatch.setattr(judged_views, "find_matched_points", lambda views: asked.append(views.valid(0)))
     assert make(folder.root).initial_data()["light"] == "fixed"
     assert np.array_equal(asked[0], np.tri(height, width) > 0)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,7 +21,6 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.engine.machine import step_generator
 from unmix_plugin.engine.model import DataManager, TrainingCallback, TrainingCallbackLocation
-from unmix_plugin.light.search import find_lamp
 from unmix_plugin.poses.knots import Knots
 from unmix_plugin.presets import fill_auto, preset_for
 from unmix_plugin.scenes.doctor import (
@@ -39,15 +38,13 @@ from unmix_plugin.scenes.evidence import (
     judge_sensors,
     relative_power,
 )
-from unmix_plugin.scenes.geometry.carving import Cells, Masks, carve, carve_by_masks, share_explained
-from unmix_plugin.scenes.geometry.lighting import judge_exposure, judge_light
-from unmix_plugin.scenes.geometry.matched_points import find_matched_points
+from unmix_plugin.scenes.geometry.carving import Masks, carve, share_explained
 from unmix_plugin.scenes.geometry.surface_evidence import SurfaceEvidence
 from unmix_plugin.scenes.geometry.view_agreement import (
-    compare_scene_conventions,
     convention_decision,
-    training_views,
 )
+from unmix_plugin.scenes.judged_views import JudgedViews, judge_views
+from unmix_plugin.scenes.kept import judged_once
 from unmix_plugin.scenes.messages import Message
 from unmix_plugin.scenes.pixel_table import PixelRays, PixelTable
 from unmix_plugin.scenes.reading.loader import load_scene
@@ -195,16 +192,16 @@ class HyperspectralDataManager(DataManager):
         most, seed, sensors = _MOST_INITIAL_PIXELS, self.seed, self.scene.sensors
         shares = self._pixels.shares
         chosen = max(shares, key=lambda sensor: (sensors[sensor].num_channels, shares[sensor]))
-        reachable, _ = self._carved
         opaque = self._pixels.sample_opaque(chosen, most, seed)
         found = {
             "knots": self._knots.positions(self.train_cameras).numpy(),
             "pixels": opaque.numpy(),
             "exposure": np.array(self._exposure(chosen, opaque)),
             "relative": np.array(relative_power(self.scene, opaque)),
-            "reachable": reachable,
+            "reachable": self._judged.reachable,
             "band_weights": band_weights(self.scene, self._noise),
-            **self._light(reachable),
+            "light": np.array(self._judged.light),
+            **({"lamp": np.array(self._judged.lamp)} if self.scene.has_alpha else {}),
         }
         if not self._is_rig:
             return found
@@ -239,12 +236,7 @@ class HyperspectralDataManager(DataManager):
 
     def decisions(self) -> list[Decision]:
         """Convention of poses, backdrop, and what lies behind the box."""
-        return [convention_decision(self._conventions), *self.scene.decisions]
-
-    @cached_property
-    def _conventions(self) -> dict[str, float]:
-        """How little the training views agree under each convention of poses."""
-        return compare_scene_conventions(self.scene)
+        return [convention_decision(self._judged.conventions), *self.scene.decisions]
 
     def warnings(self) -> list[str]:
         """Poses that seem to follow another convention, cameras far off or at one place, masks that contradict
@@ -253,7 +245,9 @@ class HyperspectralDataManager(DataManager):
         return [
             *(
                 finding.sentence(advice)
-                for finding in [check_poses(self._conventions) or self._carved[1]]
+                for finding in [
+                    check_poses(self._judged.conventions) or check_masks(self._judged.contradicted)
+                ]
                 if finding
             ),
             *self._pixels.notes,
@@ -272,7 +266,7 @@ class HyperspectralDataManager(DataManager):
         if self.scene.has_backdrop:
             yield Finding.of(Message.PLAIN_BACKDROP)
         if self._is_rig:
-            yield from check_rig(self.scene, self._initial_data["reachable"])
+            yield from check_rig(self.scene, self._judged.reachable)
 
     def identity(self, summary: Mapping[str, Any]) -> dict[str, Any]:
         """Views, cameras, bands and the hashes of what was measured."""
@@ -306,14 +300,17 @@ class HyperspectralDataManager(DataManager):
         return AlphaEvidence(self._pixels, self.scene.has_alpha and not self.options.trust_alpha)
 
     @cached_property
-    def _carved(self) -> tuple[Cells, Finding | None]:
-        """Where something may be, and what to say of masks that contradict each other; all pixels are read for it."""
-        foreground, cells = self._foreground, self.options.grid_resolution
-        if foreground is None or self.scene.is_unbounded:
-            return self._surfaces.carved(carve(self.scene, cells, foreground)), None
-        hull, contradicted = carve_by_masks(self.train_cameras, foreground, self.scene_box, cells)
-        # A backdrop was tried by that.
-        return self._surfaces.carved(hull), None if self.scene.has_backdrop else check_masks(contradicted)
+    def _judged(self) -> JudgedViews:
+        given = {
+            "files": self.scene.input_hashes,
+            "scene": self.scene.options,
+            "options": self.options,
+            "seed": self.seed,
+        }
+        cells = self.options.grid_resolution
+        return judged_once(
+            JudgedViews, given, lambda: judge_views(self.scene, self._foreground, cells, self._evidence)
+        )
 
     @property
     def _foreground(self) -> Masks | None:
@@ -324,7 +321,7 @@ class HyperspectralDataManager(DataManager):
 
     @cached_property
     def _surfaces(self) -> SurfaceEvidence:
-        return SurfaceEvidence(self.scene, self.device)
+        return SurfaceEvidence(self.scene, self._judged.depths, self.device)
 
     @cached_property
     def _shares(self) -> dict[int, float] | None:
@@ -351,23 +348,3 @@ class HyperspectralDataManager(DataManager):
             kept = torch.from_numpy(np.concatenate([mask.reshape(-1) for mask in masks]))
             opaque = self._pixels.sample_opaque(sensor, _MOST_INITIAL_PIXELS, self.seed, kept)
         return exposure_of(opaque)
-
-    def _light(self, reachable: Cells) -> dict[str, np.ndarray]:
-        """Judged by the views of the sensor that took most; and where the lamp is if it moves with the camera."""
-        if not self.scene.has_alpha:
-            return {"light": np.array(self._judge_matched())}
-        views, seen = self._evidence.log_brightness()
-        cameras = self.train_cameras[views]
-        light = judge_light(cameras, seen, reachable, self.scene_box)
-        lamp = None
-        if light == "camera":
-            lamp = find_lamp(cameras, self._evidence.log_shading(), reachable, self.scene_box)
-        return {"light": np.array(light), "lamp": np.array(() if lamp is None else lamp.numbers())}
-
-    def _judge_matched(self) -> Literal["fixed", "per-view"]:
-        """Of views without alpha: whether matched places say that they differ in exposure."""
-        views = training_views(self.scene)
-        points = find_matched_points(views)
-        if points is None:
-            return "fixed"
-        return judge_exposure(views.cameras, points.places, points.seen_by(len(views.cameras)))

@@ -11,7 +11,7 @@ from unmix_plugin.scenes.demo.scene import PLACES, make_demo_scene
 from unmix_plugin.scenes.demo.shapes import first_hits
 from unmix_plugin.scenes.geometry import surface_evidence
 from unmix_plugin.scenes.geometry.carving import carve
-from unmix_plugin.scenes.geometry.surface_evidence import SurfaceEvidence, sweep_depths
+from unmix_plugin.scenes.geometry.surface_evidence import SurfaceEvidence, sweep_depths, sweep_scene
 from unmix_plugin.scenes.geometry.views import Views
 from unmix_plugin.scenes.pixel_table import PixelTable
 from unmix_plugin.scenes.reading.loader import load_scene
@@ -37,7 +37,7 @@ def scene(folder):
 
 @pytest.fixture(scope="module")
 def evidence(scene):
-    return SurfaceEvidence(scene, CPU)
+    return SurfaceEvidence(scene, sweep_scene(scene), CPU)
 
 
 def true_distances(scene, rays):
@@ -133,7 +133,7 @@ def test_cells_that_views_look_through_are_carved_and_those_with_surfaces_are_no
 
 def test_a_bounded_scene_has_no_evidence_of_surfaces(folder):
     scene = load_scene(folder, SceneOptions(world="bounded"))
-    evidence = SurfaceEvidence(scene, CPU)
+    evidence = SurfaceEvidence(scene, sweep_scene(scene), CPU)
     reachable = carve(scene, 16)
     assert evidence.carved(reachable) is reachable
 

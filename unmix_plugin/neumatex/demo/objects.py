@@ -38,9 +38,10 @@ from unmix_plugin.neumatex.tracing.mesh import Mesh
 from unmix_plugin.neumatex.tracing.path_tracer import TracedObject
 from unmix_plugin.neumatex.tracing.rays import RayMesh, pixel_hits
 from unmix_plugin.neumatex.tracing.surface import Surface
-from unmix_plugin.scenes.demo.scene import lens_entries, transform_matrix, user_cache, written_once
+from unmix_plugin.scenes.demo.scene import lens_entries, transform_matrix, written_once
 from unmix_plugin.scenes.demo.shading import band_centers_nm
 from unmix_plugin.scenes.folder import transforms_bytes
+from unmix_plugin.scenes.kept import user_cache
 from unmix_plugin.scenes.reading.faults import FILE_NAME
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix

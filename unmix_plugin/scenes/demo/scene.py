@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import re
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -47,6 +46,7 @@ from unmix_plugin.scenes.demo.shading import (
 )
 from unmix_plugin.scenes.demo.shapes import PlacedPrimitive, Points, Rays
 from unmix_plugin.scenes.folder import lens_keys, matrix_entry, transforms_bytes
+from unmix_plugin.scenes.kept import user_cache
 from unmix_plugin.scenes.reading.faults import FILE_NAME
 from unmix_plugin.scenes.reading.images import UNLABELLED
 from unmix_plugin.spectral.bands import Bands
@@ -420,16 +420,3 @@ def _write_view(
         entry["abundance_file_path"] = f"abundances/{name}.npy"
         np.save(folder / entry["abundance_file_path"], view.abundances.astype(np.float16))
     return entry
-
-
-def user_cache() -> Path:
-    """Where generated data is kept, by the XDG base directory specification: XDG_CACHE_HOME counts only if absolute.
-    Raises SceneError: it is not set, and there is no home folder."""
-    configured = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    try:
-        return (configured if configured.is_absolute() else Path.home() / ".cache") / "unmix-nerf"
-    except RuntimeError as error:  # as in a container, for a user that it does not know
-        raise SceneError(
-            "there is no home folder to keep the demo scene in; set HOME or XDG_CACHE_HOME to a folder that can be "
-            "written, or write the scene with unmix-demo-scene DIR and train on that"
-        ) from error

@@ -133,10 +133,10 @@ def _is_hidden(
     return hidden
 
 
-_FoundLight = Literal["fixed", "camera", "per-view"]
+LightKind = Literal["fixed", "camera", "per-view"]
 
 
-def judge_light(cameras: Cameras, log_brightness: Pictures, hull: Cells, box: SceneBox) -> _FoundLight:
+def judge_light(cameras: Cameras, log_brightness: Pictures, hull: Cells, box: SceneBox) -> LightKind:
     """Which light the views were taken in; fixed where too little is seen to tell. Arguments as of `seen_places`."""
     places, seen = seen_places(cameras, log_brightness, hull, box)
     if _follows_camera(cameras, places, seen):

@@ -207,19 +207,24 @@ def seen_through(depths: SweptDepths, cameras: Cameras, box: SceneBox, cells: in
     return is_empty.view(cells, cells, cells)
 
 
+def sweep_scene(scene: Scene) -> SweptDepths | None:
+    """As `sweep_depths` of the training views; of rigs and line cameras, and of bounded scenes, nothing is known."""
+    views = training_views(scene)
+    is_compared = scene.is_unbounded and not scene.is_rig and views.cameras.key_poses is None
+    return sweep_depths(views, scene.scene_box) if is_compared else None
+
+
 class SurfaceEvidence:
     """Distances of pixels that views agree on, and the space that they show to be empty."""
 
-    def __init__(self, scene: Scene, device: torch.device) -> None:
-        """Compare the training views; of rigs and line cameras, and of bounded scenes, nothing is known.
-
+    def __init__(self, scene: Scene, depths: SweptDepths | None, device: torch.device) -> None:
+        """
         Args:
+            depths: Of the scene, by `sweep_scene`.
             device: Of the pixels that will be asked for.
         """
-        views = training_views(scene)
-        self._cameras, self._box = views.cameras, scene.scene_box
-        is_compared = scene.is_unbounded and not scene.is_rig and views.cameras.key_poses is None
-        self._depths = sweep_depths(views, scene.scene_box) if is_compared else None
+        self._cameras, self._box = training_views(scene).cameras, scene.scene_box
+        self._depths = depths
         if self._depths is not None:
             swept = torch.full((len(self._cameras),), -1)
             swept[list(self._depths.views)] = torch.arange(len(self._depths.views))

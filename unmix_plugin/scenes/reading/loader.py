@@ -15,11 +15,12 @@ from jaxtyping import Float64
 from unmix_plugin.engine.runs.atomic_files import NOT_PORTABLE, safe_name
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.scenes.folder import CUBE_KEY
+from unmix_plugin.scenes.kept import judged_once
 from unmix_plugin.scenes.messages import Message
 from unmix_plugin.scenes.reading.checks import CheckedFiles, check_frames
 from unmix_plugin.scenes.reading.entries import SceneEntry, at_sizes, locate_files, read_entries
 from unmix_plugin.scenes.reading.faults import FILE_NAME, Faults, resolve_path, sha256_of
-from unmix_plugin.scenes.reading.model_space import find_model_space, without_far_off
+from unmix_plugin.scenes.reading.model_space import ModelSpace, find_model_space, without_far_off
 from unmix_plugin.scenes.reading.splits import Split, split_frames
 from unmix_plugin.scenes.scene import Frame, Scene
 from unmix_plugin.settings import SceneOptions
@@ -129,13 +130,6 @@ def read_endmembers(
 def _assemble(
     root: Path, entry: SceneEntry, checked: CheckedFiles, truth: _Truth, split: Split, options: SceneOptions
 ) -> Scene:
-    space = find_model_space(root, entry, checked, split.train, options)
-    before, fwhm_nm, warnings = space.before_backdrop, entry.fwhm_nm, (*entry.warnings, *space.warnings)
-    if fwhm_nm is not None and (unknown := int(np.isnan(fwhm_nm).sum())):
-        warning = Message.UNKNOWN_WIDTHS.sentence(unknown=unknown, bands=len(fwhm_nm))
-        fwhm_nm, warnings = None, (*warnings, warning)
-    if before is not None and not before.shows_foreground:
-        before, warnings = None, (*warnings, Message.NOTHING_TO_SEE.sentence())
     known = {frame.cube: frame.sha256 for frame in checked.frames}
     files = [(key, path) for frame in entry.frames for key, path in frame.files.items()]
     inputs = [path for key, path in files if key in _MEASURED_KEYS] + [root / FILE_NAME, truth.light_path]
@@ -149,6 +143,18 @@ def _assemble(
         }
         return {name: known.get(path) or sha256_of(path) for name, path in found.items()}
 
+    input_hashes = hashes(inputs)
+    space = judged_once(
+        ModelSpace,
+        {"files": input_hashes, "training views": split.train, "options": options},
+        lambda: find_model_space(root, entry, checked, split.train, options),
+    )
+    before, fwhm_nm, warnings = space.before_backdrop, entry.fwhm_nm, (*entry.warnings, *space.warnings)
+    if fwhm_nm is not None and (unknown := int(np.isnan(fwhm_nm).sum())):
+        warning = Message.UNKNOWN_WIDTHS.sentence(unknown=unknown, bands=len(fwhm_nm))
+        fwhm_nm, warnings = None, (*warnings, warning)
+    if before is not None and not before.shows_foreground:
+        before, warnings = None, (*warnings, Message.NOTHING_TO_SEE.sentence())
     frames = tuple(
         Frame(
             name=name,
@@ -192,7 +198,7 @@ def _assemble(
         warnings=warnings,
         has_labels=all("seg_file_path" in files for files in evaluated),
         has_abundances=all("abundance_file_path" in files for files in evaluated),
-        input_hashes=hashes(inputs),
+        input_hashes=input_hashes,
         truth_hashes=hashes(truths),
         options=options,
         markers={
