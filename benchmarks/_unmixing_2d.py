@@ -21,8 +21,8 @@ from unmix_plugin.spectral.unmixing.num_materials import propose_num_materials
 from unmix_plugin.trained.evaluation import (
     Evaluation,
     PredictedView,
+    SceneTruth,
     ViewTruth,
-    _SceneTruth,
     scene_truth,
     view_truth,
 )
@@ -42,7 +42,7 @@ class PixelBaselines:
         Args:
             scene: Whose true materials are known.
         """
-        self.truth: _SceneTruth = scene_truth(scene)
+        self.truth: SceneTruth = scene_truth(scene)
         self._training = torch.cat([opaque_pixels(scene, index) for index in scene.train_indices])
         self._views = [view_truth(scene, index) for index in scene.eval_indices]
         self._found: dict[tuple[str, int], tuple[Tensor, float]] = {}

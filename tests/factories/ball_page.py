@@ -45,11 +45,16 @@ REGIONS = {
 }
 
 
-def export(folder, scene: Any = SCENE, regions=REGIONS, library=(), resolution=48, edits=None):
+def export(
+    folder, scene: Any = SCENE, regions=REGIONS, library=(), resolution=48, edits=None, illuminant=None
+):
     """The facts of a page, what was said while it was made, and its file."""
     said: list[str] = []
     loaded: Any = SimpleNamespace(scene=scene, materials_scene=scene, scale=scene.scale, scene_name="ball")
-    loaded.measures, loaded.record = Measures(None, regions), SimpleNamespace(summary={})
+    loaded.measures, loaded.record = (
+        Measures(None, regions),
+        SimpleNamespace(summary={"illuminant": illuminant}),
+    )
     loaded.folder = SimpleNamespace(path=Path("ball/unmix-nerf/run"))
     loaded.config = SimpleNamespace(method_name="unmix-nerf")
     job = Job(loaded, folder, True, said.append, lambda _: nullcontext(), lambda _, items: iter(items), ALONE)

@@ -26,7 +26,7 @@ from unmix_plugin.trained.trained_scene import MaterialView, TrainedScene, refer
 from unmix_plugin.viewer.rendering import painting
 from unmix_plugin.viewer.rendering.aids import LayerAids
 from unmix_plugin.viewer.rendering.painting import LAYERS, layer_named
-from unmix_plugin.viewer.rendering.pictures import Picture, PictureMaker, _Speedometer
+from unmix_plugin.viewer.rendering.pictures import Picture, PictureMaker, Speedometer
 from unmix_plugin.viewer.rendering.render_loop import RenderLoop, View
 from unmix_plugin.viewer.rendering.scene import SceneSource
 from unmix_plugin.viewer.rendering.settings import LayerSettings
@@ -116,7 +116,7 @@ class Screen:
 LARGEST = 32
 
 
-class FixedSpeed(_Speedometer):
+class FixedSpeed(Speedometer):
     """A speed that is set, not measured."""
 
     def add(self, rays, seconds):

@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 from tests.factories.ball_model import ALL_ROUND, ball_scene, seen_surface
 from tests.factories.cameras import FRAME, around
 from tests.factories.outputs import loaded_mesh
-from unmix_plugin.products.mesh import _write_mesh, gltf_content
-from unmix_plugin.products.point_cloud import _write_point_cloud
-from unmix_plugin.products.volume import _write_volume
+from unmix_plugin.products.mesh import gltf_content, write_mesh
+from unmix_plugin.products.point_cloud import write_point_cloud
+from unmix_plugin.products.volume import write_volume
 from unmix_plugin.scenes.placement import Placement
 from unmix_plugin.trained.camera_files import camera_file_bytes, read_camera_file
 from unmix_plugin.trained.run_views import RunView, positions_for_files
@@ -47,7 +47,7 @@ def columns(path):
 def test_points_are_where_the_source_says(tmp_path):
     points = seen_surface(SCENE, ALL_ROUND, 6_000).points()
     for name, frame in (("near", FRAME), ("far", FAR)):
-        _write_point_cloud([tmp_path / name], points, 300, SCENE, frame)
+        write_point_cloud([tmp_path / name], points, 300, SCENE, frame)
     near, far = columns(tmp_path / "near"), columns(tmp_path / "far")
     assert near.dtype == np.float32
     assert_close(far, source_of(near.astype(np.float64)))
@@ -56,7 +56,7 @@ def test_points_are_where_the_source_says(tmp_path):
 def test_meshes_of_all_formats_are_where_the_source_says(tmp_path):
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.5)
     mesh = TriangleMesh(np.array(ball.vertices), np.array(ball.faces))
-    ply, obj, _, glb = _write_mesh(tmp_path, ("ply", "obj", "glb"), mesh, SCENE, FAR, up="z")
+    ply, obj, _, glb = write_mesh(tmp_path, ("ply", "obj", "glb"), mesh, SCENE, FAR, up="z")
     expected = source_of(FRAME.to_world(mesh.vertices))
     assert_close(columns(ply), expected)
     lines = [line.split()[1:4] for line in obj.read_text().splitlines() if line.startswith("v ")]
@@ -68,7 +68,7 @@ def test_meshes_of_all_formats_are_where_the_source_says(tmp_path):
 def test_volumes_are_where_the_source_says(tmp_path):
     grid = GridPoints.over(SCENE.scene_box.aabb, 8)
     path = tmp_path / "volume.npz"
-    _write_volume(path, SCENE, grid, FAR, range(grid.shape[0]))
+    write_volume(path, SCENE, grid, FAR, range(grid.shape[0]))
     matrix = np.load(path)["index_to_world"]
     index = np.array([1.0, 2.0, 3.0])
     model = grid.origin.astype(np.float64) + grid.cell * index

@@ -13,7 +13,7 @@ from tests.factories.cameras import FRAME
 from tests.factories.outputs import loaded_mesh
 from tests.factories.systems import needs_xatlas
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.products.mesh import _mesh_paths, _textures, _write_mesh, export
+from unmix_plugin.products.mesh import export, textures_of, write_mesh
 from unmix_plugin.products.product import Job
 from unmix_plugin.products.scene_products import Mesh
 from unmix_plugin.trained.measures import Scale
@@ -34,8 +34,8 @@ def outside():
 @pytest.fixture(scope="module")
 def files(outside, tmp_path_factory):
     folder = tmp_path_factory.mktemp("mesh")
-    written = _write_mesh(folder, ("ply", "obj", "glb"), outside, SCENE, FRAME, up="z")
-    assert written == _mesh_paths(folder, ("ply", "obj", "glb"), None)
+    written = write_mesh(folder, ("ply", "obj", "glb"), outside, SCENE, FRAME, up="z")
+    assert [path.name for path in written] == ["mesh.ply", "mesh.obj", "mesh.mtl", "mesh.glb"]
     return {path.suffix: path for path in written}
 
 
@@ -49,7 +49,7 @@ def test_other_readers_get_the_mesh_in_the_world_of_the_scene(files, outside, ki
 
 
 def test_gltf_alone_is_in_metres_where_the_scene_has_a_scale_and_y_is_up_in_it(files, outside, tmp_path):
-    _write_mesh(tmp_path, ("glb", "ply"), outside, replace(SCENE, scale=Scale(0.025, "test")), FRAME)
+    write_mesh(tmp_path, ("glb", "ply"), outside, replace(SCENE, scale=Scale(0.025, "test")), FRAME)
     metres, units = loaded_mesh(tmp_path / "mesh.glb"), loaded_mesh(files[".glb"]).vertices
     heights = units @ world_up(SCENE.views, FRAME)
     np.testing.assert_allclose(metres.vertices[:, 1], 0.025 * heights, atol=1e-6)
@@ -64,7 +64,7 @@ def test_gltf_alone_is_in_metres_where_the_scene_has_a_scale_and_y_is_up_in_it(f
 def test_an_obj_stands_where_importers_take_y_for_up(outside, tmp_path, monkeypatch, axis):
     up = np.eye(3)["xyz".index(axis)]
     monkeypatch.setattr("unmix_plugin.products.mesh.world_up", lambda *_: up)
-    _write_mesh(tmp_path, ("obj", "ply"), outside, SCENE, FRAME)
+    write_mesh(tmp_path, ("obj", "ply"), outside, SCENE, FRAME)
     ply = PlyData.read(tmp_path / "mesh.ply")["vertex"]
     world = np.stack([ply[one] for one in "xyz"], axis=1)
     lines = [line.split() for line in (tmp_path / "mesh.obj").read_text().splitlines()]
@@ -101,8 +101,9 @@ def test_ply_and_glb_have_the_same_floats_and_vertices_the_material_of_their_hal
 @pytest.fixture(scope="module")
 def textured(outside, tmp_path_factory):
     folder = tmp_path_factory.mktemp("textured")
-    written = _write_mesh(folder, ("obj", "glb"), outside, SCENE, FRAME, "z", _textures(SCENE, outside, 256))
-    assert sorted(written) == sorted(_mesh_paths(folder, ("obj", "glb"), SCENE.materials.names))
+    written = write_mesh(folder, ("obj", "glb"), outside, SCENE, FRAME, "z", textures_of(SCENE, outside, 256))
+    pictures = [f"mesh_{name}.png" for name in ("colour", "segmentation", *ABUNDANCES)]
+    assert sorted(path.name for path in written) == sorted(["mesh.obj", "mesh.mtl", "mesh.glb", *pictures])
     return folder
 
 
@@ -154,8 +155,8 @@ def test_what_shows_nothing_from_above_has_no_material(tmp_path):
     )  # its front faces away from the ball
     beside = TriangleMesh(corners, np.array([[0, 1, 2]]))
     assert beside.normals[0, 0] < 0
-    textures = _textures(SCENE, beside, 64)
-    _write_mesh(tmp_path, ("ply", "obj"), beside, SCENE, FRAME, textures=textures)
+    textures = textures_of(SCENE, beside, 64)
+    write_mesh(tmp_path, ("ply", "obj"), beside, SCENE, FRAME, textures=textures)
     assert set(PlyData.read(tmp_path / "mesh.ply")["vertex"]["scalar_material"]) == {255}
     assert "usemtl material_3_nothing" in (tmp_path / "mesh.obj").read_text()
     assert (np.asarray(Image.open(io.BytesIO(textures.pictures["segmentation"]))) == 255).all()
@@ -177,4 +178,4 @@ def test_impossible_settings_are_refused(asked, said):
 def test_textures_that_are_too_small_or_of_no_size_are_refused(outside):
     for size, said in ((9, "--texture-size is 9; choose 16 to 8192"), (16, "choose a larger --texture-size")):
         with pytest.raises(ConfigError, match=said):
-            _textures(SCENE, outside, size)
+            textures_of(SCENE, outside, size)

@@ -108,13 +108,19 @@ def test_a_page_keeps_both_limits_and_each_surface_is_made_once(exported, tmp_pa
     assert f"as fine as {tried[-1]} cells along the longest edge, not 64: browsers turn {most:,}" in note
 
 
-def test_a_relit_page_names_the_light_that_it_shows_and_offers_the_recorded_one():
+def facts_of(folder, materials, illuminant=None):
+    """Of the ball with other materials, hardly resolved."""
+    scene = replace(SCENE, materials=materials)
+    return export(folder, scene, regions={}, resolution=12, illuminant=illuminant)[0]
+
+
+def test_a_relit_page_names_the_light_that_it_shows_and_offers_the_recorded_one(tmp_path):
     count = len(SCENE.bands)
     recorded = np.linspace(0.5, 1.0, count)
     light = torch.from_numpy(recorded).float()
     scene = replace(SCENE, materials=replace(SCENE.materials, light=light))
     relit = edit_scene(scene, Recipe(illuminant=Light("A"))).materials
-    shown, own, *others = page._spectral_facts(relit, recorded.tolist())["lights"]
+    shown, own, *others = facts_of(tmp_path, relit, recorded.tolist())["lights"]
     assert (shown["name"], shown["factors"]) == ("A", [1.0] * count)
     assert own["name"] == "the scene's own"
     spectra = relit.endmembers.numpy() * np.array(own["factors"])
@@ -123,25 +129,25 @@ def test_a_relit_page_names_the_light_that_it_shows_and_offers_the_recorded_one(
     light = present(relit.light).clone()
     light[-1] = 0.0
     ends = replace(relit, light=light)
-    for one in page._spectral_facts(ends, recorded.tolist())["lights"][1:]:
+    for one in facts_of(tmp_path, ends, recorded.tolist())["lights"][1:]:
         assert one["notes"][0] == "black where A does not reach"
         assert not any("own light" in note for note in one["notes"])
-    before = page._spectral_facts(scene.materials, recorded.tolist())["lights"]
+    before = facts_of(tmp_path, scene.materials, recorded.tolist())["lights"]
     assert [one["name"] for one in before[:2]] == ["the scene's own", "D65"]
 
 
 @pytest.mark.parametrize(("light", "is_assumed"), [(None, False), (torch.ones(len(SCENE.bands)), True)])
-def test_a_page_says_that_the_light_is_unknown_though_another_was_lit(light, is_assumed):
-    assert page._spectral_facts(SCENE.materials, None)["is_light_known"]
+def test_a_page_says_that_the_light_is_unknown_though_another_was_lit(light, is_assumed, tmp_path):
+    assert facts_of(tmp_path, SCENE.materials)["is_light_known"]
     unknown = replace(SCENE.materials, light=light, is_light_assumed=is_assumed)
-    assert not page._spectral_facts(unknown, None)["is_light_known"]
+    assert not facts_of(tmp_path, unknown)["is_light_known"]
 
 
-def test_bands_that_the_light_leaves_dark_are_those_of_the_package():
+def test_bands_that_the_light_leaves_dark_are_those_of_the_package(tmp_path):
     light = torch.ones(len(SCENE.bands))
     light[2] = 1e-4
     lit = replace(SCENE.materials, light=light)
-    found = page._spectral_facts(lit, None)["is_lit"]
+    found = facts_of(tmp_path, lit)["is_lit"]
     assert found == lit.is_lit.tolist() == [band != 2 for band in range(len(light))]
 
 
@@ -149,8 +155,9 @@ def test_through_a_sensor_no_known_spectra_and_no_other_lights_are_offered(tmp_p
     """They would be taken at the centres of its channels, which see the mean of what is around."""
     responses = np.array([[1.0, 1.0, 0.5, 0.0, 0.0], [0.0, 0.0, 0.5, 1.0, 1.0]])
     sensor = SpectralResponses("camera", SpectraTable(SCENE.bands, ("short", "long"), responses))
-    materials = with_sensor(SCENE, sensor).materials
-    assert page._known_spectra(materials, ()).sources == []
-    assert [one["name"] for one in page._spectral_facts(materials, None)["lights"]] == ["the scene's own"]
+    seen = with_sensor(SCENE, sensor)
+    facts, _, _ = export(tmp_path, seen, regions={}, resolution=12)
+    assert facts["known"] == []
+    assert [one["name"] for one in facts["lights"]] == ["the scene's own"]
     with pytest.raises(ConfigError, match=r"known in channels of --sensor, .*: leave out --library"):
-        page._known_spectra(materials, (tmp_path,))
+        export(tmp_path, seen, library=(tmp_path,))

@@ -14,17 +14,17 @@ from unmix_plugin.figures.look import NEUTRAL
 from unmix_plugin.figures.paint import ColourScale
 from unmix_plugin.figures.pictures import TitledPicture, draw_panels, in_rows
 from unmix_plugin.products import evaluation as evaluation_module
-from unmix_plugin.products.endmembers import _write_endmembers
+from unmix_plugin.products.endmembers import write_endmembers
 from unmix_plugin.products.evaluation import (
-    _draw_colour,
-    _draw_matched_abundances,
-    _draw_matched_segmentation,
+    draw_colour,
+    draw_matched_abundances,
+    draw_matched_segmentation,
     material_look,
 )
-from unmix_plugin.products.views import _scores_of, colour_panel, draw_abundances, draw_segmentation
+from unmix_plugin.products.views import colour_panel, draw_abundances, draw_segmentation, segmentation_scores
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.materials import Materials
-from unmix_plugin.trained.evaluation import Evaluation, PredictedView, ViewTruth, _SceneTruth
+from unmix_plugin.trained.evaluation import Evaluation, PredictedView, SceneTruth, ViewTruth
 from unmix_plugin.trained.run_materials import endmember_colours
 
 SCALE = ColourScale("viridis", 0.0, 1.0, "abundance")
@@ -65,7 +65,7 @@ def test_no_figure_is_cut_off_however_many_materials(count, tmp_path):
     view = rendered(given)
     assert_has_white_margins(draw_abundances("view", view, given))
     assert_has_white_margins(draw_segmentation("view", view, given))
-    _write_endmembers(tmp_path, given, around_endmembers(given))
+    write_endmembers(tmp_path, given, around_endmembers(given))
     plot = decoded((tmp_path / "endmembers.png").read_bytes())
     assert plot[:, -2:].min() == 1.0
     assert plot.min() < 0.2
@@ -103,8 +103,8 @@ def test_scores_are_what_the_ids_were_chosen_by():
     view = rendered(given)
     cosines = torch.rand(12, 16, 4)
     view = replace(view, material_scores=cosines)
-    torch.testing.assert_close(_scores_of(view, given), view.abundances)
-    probe = _scores_of(view, replace(given, segmentation="probe"))
+    torch.testing.assert_close(segmentation_scores(view, given), view.abundances)
+    probe = segmentation_scores(view, replace(given, segmentation="probe"))
     torch.testing.assert_close(probe[:, 4:], cosines[:, 4:])
     assert float(probe[:, :4].abs().max()) == 0.0
 
@@ -113,7 +113,7 @@ def test_scores_are_what_the_ids_were_chosen_by():
 def test_evaluation_figures_are_whole_with_more_as_many_and_fewer_materials(num_true):
     given = materials(3)
     view = rendered(given)
-    truth = _SceneTruth(given.bands, num_true, torch.rand(num_true, 8).double())
+    truth = SceneTruth(given.bands, num_true, torch.rand(num_true, 8).double())
     labels = (view.segmentation % num_true).masked_fill(view.segmentation == 255, 255)
     abundances = torch.nn.functional.one_hot(labels.long() % num_true, num_true).float()
     valid = torch.ones(12, 16, dtype=torch.bool)
@@ -121,11 +121,11 @@ def test_evaluation_figures_are_whole_with_more_as_many_and_fewer_materials(num_
     evaluation = Evaluation(truth, given.endmembers)
     evaluation.add(seen, view)
     look, matching = material_look(evaluation), evaluation.segmentation().matching
-    assert_has_white_margins(_draw_colour(seen, view, truth.bands, 30.0))
-    assert_has_white_margins(_draw_matched_abundances(seen, view, evaluation, look))
+    assert_has_white_margins(draw_colour(seen, view, truth.bands, 30.0))
+    assert_has_white_margins(draw_matched_abundances(seen, view, evaluation, look))
     ids = view.segmentation.numpy()
-    assert_has_white_margins(_draw_matched_segmentation("view", labels.numpy(), ids, look, matching))
-    assert_has_white_margins(_draw_matched_segmentation("view", None, ids, look, matching))
+    assert_has_white_margins(draw_matched_segmentation("view", labels.numpy(), ids, look, matching))
+    assert_has_white_margins(draw_matched_segmentation("view", None, ids, look, matching))
 
 
 def test_an_error_is_drawn_only_where_pixels_count(monkeypatch):
@@ -136,7 +136,7 @@ def test_an_error_is_drawn_only_where_pixels_count(monkeypatch):
     measured = ViewTruth("view", view.spectra * valid[..., None] * 0.5, valid)  # invalid pixels read as 0
     drawn = []
     monkeypatch.setattr(evaluation_module, "draw_panels", lambda rows, *_: drawn.extend(rows[0]) or b"")
-    _draw_colour(measured, view, given.bands, 30.0)
+    draw_colour(measured, view, given.bands, 30.0)
     error = next(panel.image for panel in drawn if panel.title == "error")
     np.testing.assert_allclose(error[:, 8:], NEUTRAL)
     assert np.ptp(error[:, 4:8]) > 0.1
@@ -144,7 +144,7 @@ def test_an_error_is_drawn_only_where_pixels_count(monkeypatch):
 
 def test_a_matched_endmember_has_the_colour_of_its_material_and_a_surplus_one_its_own():
     given = materials(3)
-    evaluation = Evaluation(_SceneTruth(given.bands, 2, torch.rand(2, 8).double()), given.endmembers)
+    evaluation = Evaluation(SceneTruth(given.bands, 2, torch.rand(2, 8).double()), given.endmembers)
     look = material_look(evaluation)
     ((first, second, third),) = look.predicted(np.array([[0, 1, 2]], dtype=np.uint8), {0: 1, 2: 0})
     np.testing.assert_array_equal(first, look.true_colours[1])

@@ -17,19 +17,17 @@ from tests.factories.cameras import FRAME
 from tests.factories.models import WAVELENGTHS_NM, make_model
 from unmix_plugin.errors import ConfigError, RunError, SpectrumError
 from unmix_plugin.products.point_cloud import (
-    _is_outlier,
-    _plane_normals,
-    _require_point_scores,
-    _thinned,
-    _write_point_cloud,
+    even_cover,
     export,
+    point_scores,
+    write_point_cloud,
 )
 from unmix_plugin.products.product import Job
 from unmix_plugin.products.scene_products import PointCloud
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
-from unmix_plugin.trained.surface import property_names
+from unmix_plugin.trained.surface import SurfacePoints, property_names
 
 
 def sphere(count: int, seed: int = 0) -> np.ndarray:
@@ -37,47 +35,56 @@ def sphere(count: int, seed: int = 0) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
+def ends(positions: np.ndarray, towards: np.ndarray | None = None) -> SurfacePoints:
+    """Ends of rays at some places, seen from where unit vectors point; from outside if none are given."""
+    seen_from = torch.from_numpy(positions if towards is None else towards)
+    one = torch.ones(len(positions), 1)
+    return SurfacePoints(torch.from_numpy(positions).float(), -seen_from.float(), one, one)
+
+
 def test_lone_points_are_told_from_a_surface():
     lone = np.array([[3.0, 0.0, 0.0], [0.0, -2.0, 0.0]])
-    alone = _is_outlier(np.concatenate([sphere(2000), lone]))
-    assert alone[-2:].all()
-    assert alone[:-2].mean() < 0.01
-    assert not any(_is_outlier(sphere(count)).any() for count in (0, 1, 8))  # company enough
+    kept, _ = even_cover(ends(np.concatenate([sphere(2000), lone])), 5000)
+    assert kept.positions.norm(dim=1).max() < 1.01
+    assert len(kept) >= 1980
+    for count in (1, 8):  # company enough
+        assert len(even_cover(ends(sphere(count)), 10)[0]) == count
 
 
 @given(st.integers(1, 400), st.integers(1, 500))
 def test_thinning_gives_distinct_points_and_never_more_than_asked_for(count, wanted):
-    positions = sphere(count, seed=count)
-    kept = _thinned(positions, wanted)
-    assert len(np.unique(kept)) == len(kept)
+    points = ends(sphere(count, seed=count))
+    kept, normals = even_cover(points, wanted)
+    assert len(kept.positions.unique(dim=0)) == len(kept) == len(normals)
     assert 1 <= len(kept) <= wanted
     if count <= wanted:
-        np.testing.assert_array_equal(kept, np.arange(count))
+        assert len(kept) >= 0.95 * count
 
 
 def test_thinning_covers_evenly_what_was_seen_unevenly():
     dense = sphere(40_000)
     dense = dense[dense[:, 2] > 0.5]
     positions = np.concatenate([sphere(20_000, seed=1), dense])
-    kept = positions[_thinned(positions, 1000)]
+    kept = even_cover(ends(positions), 1000)[0].positions.numpy()
     assert len(kept) > 900
     gaps, _ = KDTree(kept).query(positions)
     ideal = np.sqrt(4 * np.pi / 1000)
     assert gaps.max() < 1.6 * ideal
     upper = (kept[:, 2] > 0.5).mean()
     assert upper == pytest.approx(0.25, abs=0.03)
-    assert len(_thinned(np.zeros((50, 3)), 10)) == 1
+    assert len(even_cover(ends(np.zeros((50, 3)), sphere(50)), 10)[0]) == 1
 
 
 def test_normals_of_a_sphere_are_its_radii_and_face_the_viewer():
-    positions = sphere(5000)
-    outwards = _plane_normals(positions, positions, np.arange(200))
-    inwards = _plane_normals(positions, -positions, np.arange(200))
+    kept, outwards = even_cover(ends(sphere(5000)), 5000)
+    positions = kept.positions.double().numpy()
+    same, inwards = even_cover(ends(sphere(5000), -sphere(5000)), 5000)
     np.testing.assert_allclose(np.linalg.norm(outwards, axis=1), 1, atol=1e-9)
-    assert (outwards * positions[:200]).sum(axis=1).min() > 0.99
+    assert (outwards * positions).sum(axis=1).min() > 0.98
+    np.testing.assert_array_equal(same.positions, kept.positions)
     np.testing.assert_allclose(inwards, -outwards)
-    towards = np.array([[0.0, 0.0, 2.0], [1.0, 0.0, 0.0]])  # where there is no plane, the viewer's direction
-    np.testing.assert_allclose(_plane_normals(0 * towards, towards, np.arange(2)), [[0, 0, 1], [1, 0, 0]])
+    towards = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])  # where there is no plane, the viewer's direction
+    np.testing.assert_allclose(even_cover(ends(0 * towards, towards), 2)[1], towards)
 
 
 BANDS = Bands.of(WAVELENGTHS_NM)
@@ -95,12 +102,12 @@ def paint(tmp_path):
 def test_named_indices_keep_their_names_and_the_rest_is_numbered(paint):
     outputs = ("index:r650/r450", "index:PRI", "index:iron-oxide", "index:1+r450", f"target:ace:{paint}")
     outputs += ("index: PRI", "index:r650/r450")  # asked for twice
-    names = [score.property for score in _require_point_scores(outputs, BANDS)]
+    names = [score.property for score in point_scores(outputs, BANDS)]
     assert names == ["index_1", "index_pri", "index_iron_oxide", "index_2", "target_1"]
 
 
 def test_a_target_is_judged_against_the_points_themselves(paint):
-    (score,) = _require_point_scores([f"target:mf:{paint}"], BANDS)
+    (score,) = point_scores([f"target:mf:{paint}"], BANDS)
     others = 0.3 + 0.05 * torch.randn(400, 5, generator=torch.Generator().manual_seed(0))
     values = score.values(torch.cat([others, PAINT[None]]), None)
     assert values[-1] == pytest.approx(1.0, abs=1e-4)
@@ -108,7 +115,7 @@ def test_a_target_is_judged_against_the_points_themselves(paint):
 
 
 def test_a_comment_says_what_a_property_is_and_whether_the_light_was_known():
-    formula, named = _require_point_scores(["index:r650/r450", "index:pri"], BANDS)
+    formula, named = point_scores(["index:r650/r450", "index:pri"], BANDS)
     unknown, known = make_model().materials, make_model(light=LIGHT).materials
     [said] = formula.comments(known)
     assert said == "index_1: index:r650/r450, formula r650/r450, from the bands at 450, 650 nm"
@@ -119,7 +126,7 @@ def test_a_comment_says_what_a_property_is_and_whether_the_light_was_known():
 @pytest.mark.parametrize("output", ["rgb", "band:650nm", "index", "index:", "target:", "ndvi", ""])
 def test_other_outputs_are_refused_with_what_points_take(output):
     with pytest.raises(ConfigError, match=f"--outputs {output}: points take spectral indices, index:NAME"):
-        _require_point_scores(["index:pri", output], BANDS)
+        point_scores(["index:pri", output], BANDS)
 
 
 def test_what_cannot_be_computed_or_shows_nothing_is_refused(points, tmp_path):
@@ -129,13 +136,13 @@ def test_what_cannot_be_computed_or_shows_nothing_is_refused(points, tmp_path):
         ("target:none.csv", ConfigError, "none.csv"),
     ):
         with pytest.raises(error, match=message):
-            _require_point_scores([output], BANDS)
+            point_scores([output], BANDS)
     for count in (0, -3, 10_000_001):
         with pytest.raises(ConfigError, match=f"--num-points is {count}; choose 1 to 10000000"):
             export(MagicMock(spec=Job, materials=SCENE.materials), PointCloud(num_points=count))
     nothing = points.select(torch.zeros(len(points), dtype=torch.bool))
     with pytest.raises(RunError, match="no ray of the run's cameras ends on a surface"):
-        _write_point_cloud([tmp_path / "points.ply"], nothing, 800, SCENE, FRAME)
+        write_point_cloud([tmp_path / "points.ply"], nothing, 800, SCENE, FRAME)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -150,7 +157,7 @@ def points():
 @pytest.fixture(scope="module")
 def cloud(points, tmp_path_factory):
     path = tmp_path_factory.mktemp("cloud") / "points.ply"
-    count = _write_point_cloud([path], points, 800, SCENE, FRAME)
+    count = write_point_cloud([path], points, 800, SCENE, FRAME)
     return PlyData.read(path), count
 
 
@@ -199,9 +206,9 @@ def test_indices_targets_and_nearest_spectra_are_written_for_each_point(points, 
     write_spectra_csv(tmp_path / "two.csv", SpectraTable(SCENE.bands, ("moss", "red clay"), spectra[[1, 0]]))
     asked = ["index:r650/r500", "index:pri", f"target:{tmp_path / 'top.csv'}<0.1"]
     asked += [f"library:{tmp_path / 'two.csv'}<0.1"]
-    scores = _require_point_scores(asked, SCENE.bands)
+    scores = point_scores(asked, SCENE.bands)
     path = tmp_path / "points.ply"
-    count = _write_point_cloud([path], points, 300, SCENE, FRAME, scores)
+    count = write_point_cloud([path], points, 300, SCENE, FRAME, scores)
     ply = PlyData.read(path)
     written = [one.name.removeprefix("scalar_") for one in ply["vertex"].properties[-4:]]
     assert written == ["index_1", "index_pri", "target_1", "library_1"]
@@ -229,7 +236,7 @@ def test_las_has_the_numbers_of_ply_with_all_bands_and_abundances(suffix, points
     paths = [tmp_path / "points.ply", tmp_path / f"points.{suffix}"]
     light = torch.linspace(0.5, 1, len(BANDS))
     lit = replace(SCENE, materials=replace(SCENE.materials, light=light))
-    count = _write_point_cloud(paths, points, 300, lit, FRAME, (), "reflectance")
+    count = write_point_cloud(paths, points, 300, lit, FRAME, (), "reflectance")
     ply, las = PlyData.read(str(paths[0]))["vertex"].data, laspy.read(paths[1])
     assert len(las.points) == len(ply) == count
     position = np.stack([ply[axis] for axis in "xyz"], axis=1)

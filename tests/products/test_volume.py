@@ -8,7 +8,7 @@ from tests.factories.ball_model import INNER_RADIUS, RADIUS, ball_scene
 from tests.factories.cameras import FRAME
 from tests.factories.models import make_scene
 from unmix_plugin.errors import ConfigError, RunError
-from unmix_plugin.products.volume import _write_volume
+from unmix_plugin.products.volume import write_volume
 from unmix_plugin.trained.surface import GridPoints, sample_field
 
 SCENE = ball_scene()
@@ -18,7 +18,7 @@ GRID = GridPoints.over(SCENE.scene_box.aabb, 16)
 @pytest.fixture(scope="module")
 def volume(tmp_path_factory):
     path = tmp_path_factory.mktemp("volume") / "volume.npz"
-    _write_volume(path, SCENE, GRID, FRAME, range(GRID.shape[0]))
+    write_volume(path, SCENE, GRID, FRAME, range(GRID.shape[0]))
     with np.load(path, allow_pickle=False) as arrays:
         return {name: arrays[name] for name in arrays.files}
 
@@ -88,5 +88,5 @@ def test_a_disk_that_is_full_half_way_leaves_nothing(tmp_path):
         raise OSError(28, "No space left on device")
 
     with pytest.raises(RunError, match=r"volume\.npz: No space left on device"):
-        _write_volume(tmp_path / "volume.npz", SCENE, GRID, FRAME, slices())
+        write_volume(tmp_path / "volume.npz", SCENE, GRID, FRAME, slices())
     assert list(tmp_path.iterdir()) == []

@@ -16,8 +16,8 @@ from unmix_plugin.trained.evaluation import (
     _VIEW_FIGURES,
     Evaluation,
     PredictedView,
+    SceneTruth,
     ViewTruth,
-    _SceneTruth,
     finite_or_none,
     scene_truth,
 )
@@ -27,7 +27,7 @@ SHUFFLED = [2, 0, 1]
 
 BANDS = Bands.of([450, 500, 550, 600, 650])
 ENDMEMBERS = torch.tensor([[9, 1, 1, 2, 3], [1, 8, 3, 1, 1], [2, 2, 2, 9, 6]], dtype=torch.float64) / 10
-SCENE = _SceneTruth(BANDS, 3, ENDMEMBERS, ("a", "b", "c"))
+SCENE = SceneTruth(BANDS, 3, ENDMEMBERS, ("a", "b", "c"))
 """Three materials in five bands."""
 
 LABELS = (torch.arange(12) // 4).to(torch.uint8).repeat(10, 1)
@@ -67,7 +67,7 @@ def test_a_perfect_prediction_has_no_error_whatever_the_order_of_its_endmembers(
 
 def test_figures_without_truth_are_unknown_and_the_others_stay():
     """Half the light costs PSNR and no angle; a small image has no SSIM, and an empty one no PSNR of matter."""
-    evaluation = Evaluation(_SceneTruth(BANDS, 0), ENDMEMBERS)
+    evaluation = Evaluation(SceneTruth(BANDS, 0), ENDMEMBERS)
     dim = replace(perfect([0, 1, 2]), spectra=VIEW.spectra * 0.5)
     evaluation.add(ViewTruth("view", VIEW.spectra, VIEW.valid), dim)
     figures = finite_or_none(evaluation.figures())
@@ -186,7 +186,7 @@ def test_a_view_is_measured_as_its_sensor_sees_it():
     spectra = torch.rand(10, 12, 5, generator=torch.Generator().manual_seed(4))
     measured = torch.stack([spectra[..., :2].mean(dim=-1), spectra[..., 3]], dim=-1)
     valid = torch.ones(10, 12, dtype=torch.bool)
-    evaluation = Evaluation(_SceneTruth(Bands.of([450, 500, 550, 600, 650]), 0), torch.rand(3, 5))
+    evaluation = Evaluation(SceneTruth(Bands.of([450, 500, 550, 600, 650]), 0), torch.rand(3, 5))
     flat = torch.zeros(10, 12)
     predicted = PredictedView(spectra, flat, torch.zeros(10, 12, 3), flat.byte(), torch.zeros(10, 12, 3))
     figures = evaluation.add(ViewTruth("a", measured, valid, sensor=sensor), predicted)
@@ -227,7 +227,7 @@ def test_pixels_that_were_measured_blown_out_stay_so_in_another_light_and_others
     shown[:3] -= 0.3
     flat = torch.ones(10, 12)
     predicted = PredictedView(shown - 0.01, flat, flat[..., None], flat.byte(), flat[..., None])
-    figures = Evaluation(_SceneTruth(Bands.of([500, 600]), 0), torch.ones(1, 2)).add(relit, predicted)
+    figures = Evaluation(SceneTruth(Bands.of([500, 600]), 0), torch.ones(1, 2)).add(relit, predicted)
     assert figures["psnr_unsaturated"] == pytest.approx(40.0, abs=1e-2)
     assert figures["psnr"] < 20
 

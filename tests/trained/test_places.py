@@ -28,7 +28,7 @@ from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.settings import SceneOptions
 from unmix_plugin.trained.places import MeasuredScene, Pixel, Point, spectrum_at
 from unmix_plugin.trained.run_views import RunView
-from unmix_plugin.viewer.panels.probe import _take_probe
+from unmix_plugin.viewer.panels.probe import take_probe
 from unmix_plugin.viewer.rendering.pictures import PictureMaker
 from unmix_plugin.viewer.rendering.scene import Edit, MeasuredViews, SceneSource
 
@@ -163,7 +163,7 @@ def test_viewer_export_and_python_say_the_same_of_a_place(scene, trained, measur
     maker.aids.measured = MeasuredViews(scene, source)
     taken, turn = [], turns.viewing_turn
     turns.viewing_turn = lambda cost: taken.append(cost) or turn(cost)  # type: ignore[method-assign]
-    clicked = _take_probe(maker, Edit(), camera, (13.2, 12.9), 1)
+    clicked = take_probe(maker, Edit(), camera, (13.2, 12.9), 1)
     assert len(taken) == 1
     np.testing.assert_array_equal(clicked.measured, python.measured.mean)
     assert clicked.measured_in == f"{len(python.measured.views)} training views, mean"

@@ -12,7 +12,7 @@ from tests.factories.edited_scenes import CAMERAS, lit_scene
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.trained.measures import Scale
-from unmix_plugin.viewer.panels.probe import _abundances_csv, _ProbedPoint, _spectra_csv, surface_at
+from unmix_plugin.viewer.panels.probe import ProbedPoint, abundances_csv, spectra_csv, surface_at
 from unmix_plugin.viewer.view_cameras import camera_of, pose_of
 
 TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -25,7 +25,7 @@ def camera(source):
 
 
 def probed(scene, camera, column, row):
-    return _ProbedPoint(1, *surface_at(scene, camera, (column, row)), scene.materials)
+    return ProbedPoint(1, *surface_at(scene, camera, (column, row)), scene.materials)
 
 
 @pytest.fixture
@@ -68,7 +68,7 @@ def test_what_users_read_of_a_place_is_in_the_world(source, camera, taken):
     np.testing.assert_array_equal(moved.point, taken.point)
     expected = WORLD.to_world(taken.point[None])[0]
     np.testing.assert_allclose(moved.world, expected, rtol=1e-6)
-    rows = list(csv.reader(io.StringIO(_abundances_csv([moved]).decode())))
+    rows = list(csv.reader(io.StringIO(abundances_csv([moved]).decode())))
     np.testing.assert_allclose([float(value) for value in rows[1][1:4]], expected, rtol=1e-6)
 
 
@@ -84,13 +84,13 @@ def test_the_files_of_probes_hold_every_number(taken):
     odd = replace(taken.materials, names=("a,b", 'c"d', "e"))  # stay one field each
     taken = replace(taken, materials=odd)
     measured = replace(taken, number=2, measured=taken.predicted * 2, measured_in="train_003")
-    rows = list(csv.reader(io.StringIO(_spectra_csv([taken, measured]).decode())))
+    rows = list(csv.reader(io.StringIO(spectra_csv([taken, measured]).decode())))
     assert rows[0] == ["wavelength", "probe_1_predicted", "probe_2_predicted", "probe_2_measured"]
     values = np.array(rows[1:], dtype=float)
     np.testing.assert_allclose(values[:, 0], taken.materials.bands.centers_nm)
     np.testing.assert_allclose(values[:, 3], 2 * taken.predicted, rtol=1e-7)
     measured = replace(measured, materials=replace(odd, light=torch.ones(5), light_name="A"))
-    rows = list(csv.reader(io.StringIO(_abundances_csv([taken, measured]).decode())))
+    rows = list(csv.reader(io.StringIO(abundances_csv([taken, measured]).decode())))
     assert rows[0][:7] == ["probe", "x", "y", "z", "metres_per_unit", "material", "measured_in"]
     assert rows[0][7:9] == ["quantity", "light"]
     names = taken.materials.names
@@ -100,8 +100,8 @@ def test_the_files_of_probes_hold_every_number(taken):
     np.testing.assert_allclose([float(value) for value in rows[1][9::3]], taken.found.abundances, atol=1e-5)
     np.testing.assert_allclose([float(value) for value in rows[1][1:4]], taken.world, rtol=1e-7)
     renamed = replace(taken, materials=replace(odd, names=("e", "new", "a,b")))
-    rows = list(csv.reader(io.StringIO(_abundances_csv([taken, renamed]).decode())))
+    rows = list(csv.reader(io.StringIO(abundances_csv([taken, renamed]).decode())))
     assert rows[0][9::3] == ["a,b", 'c"d', "e", "new"]
     assert rows[2][9::3] == [rows[1][15], "", rows[1][9], rows[1][12]]
-    rows = list(csv.reader(io.StringIO(_abundances_csv([taken], Scale(0.25, "known")).decode())))
+    rows = list(csv.reader(io.StringIO(abundances_csv([taken], Scale(0.25, "known")).decode())))
     assert rows[1][4] == "0.25"

@@ -10,7 +10,7 @@ from unmix_plugin.engine.training.progress import TrainingStatus
 from unmix_plugin.engine.training.training_control import TrainingControl
 from unmix_plugin.viewer.recipes import RecipeHistory
 from unmix_plugin.viewer.rendering.settings import LayerSettings
-from unmix_plugin.viewer.server import _KEPT_S, _KeptPages
+from unmix_plugin.viewer.server import KeptPages
 from unmix_plugin.viewer.session import PageState, Services
 
 
@@ -20,13 +20,13 @@ def state(rows):
 
 def test_the_page_that_was_closed_last_comes_back_first_and_once_unless_that_is_long_ago():
     now = [0.0]
-    pages = _KeptPages(lambda: now[0])
+    pages = KeptPages(lambda: now[0])
     for rows in (100, 200):
         pages.leave("mine", state(rows))
     pages.leave("other", state(300))
     kept = [pages.take("mine") for _ in range(3)]
     assert [one and one.largest_height for one in kept] == [200, 100, None]
-    now[0] = _KEPT_S
+    now[0] = 600.0
     assert pages.take("other") is None
 
 

@@ -39,7 +39,7 @@ def export(job: Job, asked: Endmembers) -> list[Path]:
         job.claim([*paths, angles_path])
         job.say("without angles.csv: known spectra are compared in the run's own bands, without --sensor")
         nothing = Interval.unknown(np.zeros(materials.endmembers.shape), COVERAGE, "")
-        _write_endmembers(job.folder, materials, nothing)  # errors are known in the run's own bands
+        write_endmembers(job.folder, materials, nothing)  # errors are known in the run's own bands
         remove(angles_path)  # of an earlier export, to spectra in other bands
         return [path for path in paths if path.exists()]
     light = job.scene.light_power
@@ -48,7 +48,7 @@ def export(job: Job, asked: Endmembers) -> list[Path]:
     if not materials.is_light_known:
         job.say(LIGHT_UNKNOWN)
     interval = job.scene.endmember_interval()
-    _write_endmembers(job.folder, materials, interval)
+    write_endmembers(job.folder, materials, interval)
     if interval.not_determined:
         unknown = [
             name for name, low in zip(materials.names, interval.low, strict=True) if np.isnan(low).all()
@@ -101,7 +101,7 @@ def write_intervals(path: Path, bands: Bands, names: Sequence[str], interval: In
     write_spectra_csv(path, SpectraTable(bands, titles, ends))
 
 
-def _write_endmembers(folder: Path, materials: Materials, interval: Interval) -> None:
+def write_endmembers(folder: Path, materials: Materials, interval: Interval) -> None:
     """Write the endmembers as CSV (wavelength in nm, a column a spectrum) and the same of the ends of their intervals,
     ENVI spectral library and plot."""
     table_path, intervals_path, *_, plot_path = _endmember_paths(make_folder(folder))

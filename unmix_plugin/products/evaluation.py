@@ -151,7 +151,7 @@ def evaluate_spectra(pipeline: Pipeline, measured: Scene, folder: Path, follow: 
         if not opacity:
             figures["psnr_white"] = math.nan
         if not own.num_pictures:
-            drawn = _draw_colour(view, predicted, bands, figures["psnr"])
+            drawn = draw_colour(view, predicted, bands, figures["psnr"])
             write_file(folder / "rgb" / f"{view.name}.png", drawn)
             num_pictures += 1
     found = _evaluated(evaluation, {"own": own.figures, "own_per_image": own.per_image}, num_pictures)
@@ -200,8 +200,8 @@ def evaluate_scene(
             if measured.is_rig:
                 evaluation.sensors[view.name] = measured.sensor_of(index).name
             psnr_db, name = evaluation.add(view, predicted)["psnr"], f"{view.name}.png"
-            write_file(folder / "rgb" / name, _draw_colour(view, predicted, truth.bands, psnr_db))
-            drawn = _draw_matched_abundances(view, predicted, evaluation, look)
+            write_file(folder / "rgb" / name, draw_colour(view, predicted, truth.bands, psnr_db))
+            drawn = draw_matched_abundances(view, predicted, evaluation, look)
             write_file(folder / "abundances" / name, drawn)
             ids[index] = predicted.segmentation.numpy()
     parts = processes.gather((evaluation, ids))
@@ -214,7 +214,7 @@ def evaluate_scene(
         name, labels = measured.frames[index].name, measured.labels(index)
         if labels is not None:
             labels = np.where(measured.valid_mask(index), labels, np.uint8(NOTHING_ID))
-        drawn = _draw_matched_segmentation(name, labels, ids[index], look, matching)
+        drawn = draw_matched_segmentation(name, labels, ids[index], look, matching)
         write_file(folder / "segmentation" / f"{name}.png", drawn)
     return _evaluated(evaluation, {"aligned": list(scene.fitted)} if scene.fitted else {}, 3 * len(ids))
 
@@ -277,7 +277,7 @@ def material_look(evaluation: Evaluation) -> MaterialLook:
     )
 
 
-def _draw_colour(view: ViewTruth, predicted: PredictedView, bands: Bands, psnr_db: float) -> bytes:
+def draw_colour(view: ViewTruth, predicted: PredictedView, bands: Bands, psnr_db: float) -> bytes:
     """True colour, predicted colour, and their difference; in false colours for sensors without all bands."""
     weights, spectra = view.colour_weights(bands), view.shown(predicted)
     error = np.abs(_srgb_on_black(spectra, weights) - _srgb_on_black(view.spectra, weights)).mean(axis=-1)
@@ -293,7 +293,7 @@ def _draw_colour(view: ViewTruth, predicted: PredictedView, bands: Bands, psnr_d
     return draw_panels([panels], heading, scale_of(_ERROR))
 
 
-def _draw_matched_segmentation(
+def draw_matched_segmentation(
     name: str,
     labels: UInt8[np.ndarray, "H W"] | None,
     ids: UInt8[np.ndarray, "H W"],
@@ -313,7 +313,7 @@ def _draw_matched_segmentation(
     return draw_panels([panels], f"{name}: segmentation", legend=true_entries + legend)
 
 
-def _draw_matched_abundances(
+def draw_matched_abundances(
     view: ViewTruth, predicted: PredictedView, evaluation: Evaluation, look: MaterialLook
 ) -> bytes:
     """Each true material's abundance above that of the endmember matched to it; surplus endmembers at the end."""

@@ -64,10 +64,10 @@ def export(job: Job, asked: Mesh) -> list[Path]:
     textures = None
     if has_textures:
         with job.working("making textures"):
-            textures = _textures(job.scene, mesh, asked.texture_size)
+            textures = textures_of(job.scene, mesh, asked.texture_size)
         job.say(f"textures of {textures.size} x {textures.size} texels")
     with job.working("making the mesh"):
-        written = _write_mesh(job.folder, formats, mesh, job.scene, job.frame, asked.up, textures)
+        written = write_mesh(job.folder, formats, mesh, job.scene, job.frame, asked.up, textures)
     fate = "is a guess that closes it" if keeps_unseen else "was cut away"
     found = f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles"
     job.say(f"{found}; {unseen:.0%} of the closed surface no camera sees, which {fate}")
@@ -84,7 +84,7 @@ def say_units(job: Job, file: str) -> None:
 
 
 def _mesh_paths(folder: Path, formats: Sequence[str], textured: Sequence[str] | None) -> list[Path]:
-    """Files that `_write_mesh` makes; `textured` are the names of the materials if there are textures."""
+    """Files that `write_mesh` makes; `textured` are the names of the materials if there are textures."""
     paths = [path for kind in formats for path in _paths(folder, kind)]
     if textured is not None and "obj" in formats:
         names = ("colour", "segmentation", *property_names(tuple(textured)))
@@ -103,7 +103,7 @@ _TEXELS = 1 << 16
 
 
 @dataclass(frozen=True)
-class _Textures:
+class Textures:
     """Texture coordinates of a mesh, and what its surface looks like at every texel."""
 
     atlas: Atlas
@@ -112,7 +112,7 @@ class _Textures:
     """PNG: `colour` (sRGB), `segmentation` (ids with a palette), `abundance_NAME` of each material (8 bits)."""
 
 
-def _textures(scene: TrainedScene, mesh: TriangleMesh, size: int | None) -> _Textures:
+def textures_of(scene: TrainedScene, mesh: TriangleMesh, size: int | None) -> Textures:
     """Unwrap the mesh and look at the surface from straight above each texel."""
     low, high = 16, 8192
     if size is not None and not low <= size <= high:
@@ -139,7 +139,7 @@ def _textures(scene: TrainedScene, mesh: TriangleMesh, size: int | None) -> _Tex
     for index, name in enumerate(property_names(names)):
         about = f"share of {names[index]}: 0 to 255 are 0 to 1"
         pictures[name] = rgba_png_bytes(np.ascontiguousarray(share_pictures[..., index]), about)
-    return _Textures(atlas, size, pictures)
+    return Textures(atlas, size, pictures)
 
 
 def _unwrapped(mesh: TriangleMesh, sizes: Sequence[int]) -> tuple[Atlas, int]:
@@ -150,14 +150,14 @@ def _unwrapped(mesh: TriangleMesh, sizes: Sequence[int]) -> tuple[Atlas, int]:
     return unwrap(mesh.vertices, mesh.faces, sizes[-1]), sizes[-1]
 
 
-def _write_mesh(
+def write_mesh(
     folder: Path,
     formats: Sequence[str],
     mesh: TriangleMesh,
     scene: TrainedScene,
     frame: Normalisation,
     up: Literal["y", "z"] = "y",
-    textures: _Textures | None = None,
+    textures: Textures | None = None,
 ) -> list[Path]:
     """Write a mesh with the colour, material and abundances of each vertex, seen from straight above it.
 
@@ -211,7 +211,7 @@ def _write_obj(
     normals: Float32[np.ndarray, "V 3"],
     looks: SurfaceAppearance,
     up: Float64[np.ndarray, "3"],
-    textures: _Textures | None,
+    textures: Textures | None,
 ) -> list[Path]:
     turn = turn_to_y(up)
     comments = looks.comments(_WHAT)

@@ -128,7 +128,7 @@ _LONGEST_COMMENT = 300
 
 
 @dataclass(frozen=True)
-class _PointScore:
+class PointScore:
     """A number to add to every point."""
 
     output: str
@@ -153,12 +153,12 @@ class _PointScore:
         return [comment, *(f"{self.property} {index}: {name}" for index, (name, _) in classes)]
 
 
-def _require_point_scores(
+def point_scores(
     outputs: Sequence[str], bands: Bands, lit: Bool[Tensor, "B"] | None = None
-) -> list[_PointScore]:
+) -> list[PointScore]:
     """Numbers to add to points, each once; called `index_ndvi` of a named index, else by kind and number: formats know
     few characters."""
-    scores: dict[str, _PointScore] = {}
+    scores: dict[str, PointScore] = {}
     counts: Counter[str] = Counter()
     for asked in outputs:
         kind, colon, argument = asked.partition(":")
@@ -174,7 +174,7 @@ def _require_point_scores(
         if output not in scores:
             counts[kind] += not is_named
             name = f"index_{plain.replace('-', '_')}" if is_named else f"{kind}_{counts[kind]}"
-            scores[output] = _PointScore(output, name, parse_reflectance_map(output, bands, lit))
+            scores[output] = PointScore(output, name, parse_reflectance_map(output, bands, lit))
     return list(scores.values())
 
 
@@ -189,7 +189,7 @@ def export(job: Job, asked: PointCloud) -> list[Path]:
     (low, high), count, materials = _COUNT_BOUNDS, asked.num_points, job.materials
     if not low <= count <= high:
         raise ConfigError(f"--num-points is {count}; choose {low} to {high}")
-    scores = _require_point_scores(asked.outputs, materials.bands, materials.is_lit)
+    scores = point_scores(asked.outputs, materials.bands, materials.is_lit)
     for score in scores:
         find_output(score.output, materials)  # which refuses libraries through another sensor
     if asked.spectra == "reflectance" and not materials.is_light_known:
@@ -205,20 +205,20 @@ def export(job: Job, asked: PointCloud) -> list[Path]:
     cameras = [view.camera for view in job.views("all")]
     surface = SeenSurface(job.scene, _RAYS_PER_POINT * count, cameras, job.follow)
     with job.working("cleaning and thinning the points"):
-        written = _write_point_cloud(
+        written = write_point_cloud(
             paths, surface.points(), count, job.scene, job.frame, scores, asked.spectra
         )
     job.say(counted(written, "point"))
     return paths
 
 
-def _write_point_cloud(
+def write_point_cloud(
     paths: Sequence[Path],
     points: SurfacePoints,
     num_points: int,
     scene: TrainedScene,
     frame: Normalisation,
-    scores: Sequence[_PointScore] = (),
+    scores: Sequence[PointScore] = (),
     spectra: Literal["none", "radiance", "reflectance"] = "none",
 ) -> int:
     """Write at most so many points, binary, in world coordinates, to each file in the format of its suffix; say how

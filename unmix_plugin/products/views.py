@@ -68,7 +68,7 @@ def segmentation(job: Job, asked: Segmentation) -> list[Path]:
     def write(name: str, view: MaterialView) -> None:
         scores, figure, labels = paths(name)
         seen = predicted_view(view)
-        write_file(scores, array_bytes(_scores_of(seen, job.materials).numpy().astype(np.float32)))
+        write_file(scores, array_bytes(segmentation_scores(seen, job.materials).numpy().astype(np.float32)))
         write_file(figure, draw_segmentation(name, seen, job.materials))
         save(view, "segmentation", labels)
 
@@ -92,7 +92,7 @@ def _save(folder: Path, formats: Sequence[str], output: str, name: str, view: Ma
         save(view, output, _paths(folder, [kind], name)[0], label=name)
 
 
-def _scores_of(view: PredictedView, materials: Materials) -> Float[Tensor, "H W K"]:
+def segmentation_scores(view: PredictedView, materials: Materials) -> Float[Tensor, "H W K"]:
     """What the ids are chosen by: abundances, or cosines to the endmembers (0 where nothing is)."""
     if materials.segmentation == "abundances":
         return view.abundances

@@ -27,11 +27,11 @@ def export(job: Job, asked: Volume) -> list[Path]:
     """Sample the field, slice by slice."""
     grid, path = GridPoints.over(job.scene.scene_box.aabb, asked.resolution), job.folder / "volume.npz"
     job.claim([path])
-    _write_volume(path, job.scene, grid, job.frame, job.follow("sampling the field", range(grid.shape[0])))
+    write_volume(path, job.scene, grid, job.frame, job.follow("sampling the field", range(grid.shape[0])))
     return [path]
 
 
-def _write_volume(
+def write_volume(
     path: Path, scene: TrainedScene, grid: GridPoints, frame: Normalisation, slices: Iterable[int]
 ) -> None:
     """Write a volume, of which one slice is in memory at a time, and all densities.

@@ -230,7 +230,7 @@ class ViewTruth:
 
 
 @dataclass(frozen=True)
-class _SceneTruth:
+class SceneTruth:
     """What is known of a scene's materials."""
 
     bands: Bands
@@ -240,7 +240,7 @@ class _SceneTruth:
     """True radiance of each material: reflectance x illuminant, under flat light where the illuminant is unknown."""
     names: tuple[str, ...] | None = None
 
-    def in_light(self, factors: Float[np.ndarray, " B"] | None) -> _SceneTruth:
+    def in_light(self, factors: Float[np.ndarray, " B"] | None) -> SceneTruth:
         """The scene in another light; itself where `factors` are None."""
         if factors is None or self.endmembers is None:
             return self
@@ -265,7 +265,7 @@ class Evaluation:
 
     def __init__(
         self,
-        truth: _SceneTruth,
+        truth: SceneTruth,
         endmembers: Float[Tensor, "P B"] | None,
         names: tuple[str, ...] | None = None,
     ) -> None:
@@ -384,7 +384,7 @@ class Evaluation:
         return linear_to_srgb(linear.clamp(0, 1))
 
 
-def scene_truth(scene: Scene) -> _SceneTruth:
+def scene_truth(scene: Scene) -> SceneTruth:
     """What a scene says of its materials."""
     endmembers = None
     if scene.endmembers is not None:
@@ -397,7 +397,7 @@ def scene_truth(scene: Scene) -> _SceneTruth:
         labels = (found for index in scene.eval_indices if (found := scene.labels(index)) is not None)
         greatest = (int(one.max(where=one != NOTHING_ID, initial=0)) for one in labels)
         num_materials = max((label + 1 for label in greatest), default=0)
-    return _SceneTruth(Bands.of(scene.wavelengths_nm), num_materials, endmembers, scene.material_names)
+    return SceneTruth(Bands.of(scene.wavelengths_nm), num_materials, endmembers, scene.material_names)
 
 
 def view_truth(scene: Scene, index: int) -> ViewTruth:

@@ -34,7 +34,7 @@ _STORAGE_KEY = "unmix-nerf"
 _ANSWER_S = 2.0
 
 
-class _KeptPages:
+class KeptPages:
     """States of pages that were closed recently, by the browser that they were in."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -77,7 +77,7 @@ class Viewer:
         """`say` prints a line on the user's terminal; a ConfigError if the token can't be read."""
         self._options, self._say = options, say
         self._authentication = Authentication(options.host, options.secret(os.environ), say)
-        self._kept_pages = _KeptPages()
+        self._kept_pages = KeptPages()
         self.services = services
         self._sessions: dict[int, Session] = {}
         self._lock = threading.Lock()

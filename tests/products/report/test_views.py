@@ -24,7 +24,7 @@ from unmix_plugin.products.report.report import _figure_rows, _png_url, _render_
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.material_library import measured_library
 from unmix_plugin.spectral.materials import Materials
-from unmix_plugin.trained.evaluation import Evaluation, PredictedView, ViewTruth, _SceneTruth
+from unmix_plugin.trained.evaluation import Evaluation, PredictedView, SceneTruth, ViewTruth
 
 BANDS = Bands.of([450, 500, 550, 600, 650])
 SPECTRA = torch.tensor([[0.9, 0.1, 0.1, 0.2, 0.3], [0.1, 0.8, 0.3, 0.1, 0.1], [0.2, 0.2, 0.2, 0.9, 0.6]])
@@ -46,7 +46,7 @@ def striped(name, offset=0.0):
 
 
 def gathered(offsets, with_truth=True, materials=MATERIALS) -> Any:
-    truth = _SceneTruth(BANDS, 3, SPECTRA.double(), ("clay", "leaf", "paint"))
+    truth = SceneTruth(BANDS, 3, SPECTRA.double(), ("clay", "leaf", "paint"))
     evaluation = Evaluation(truth, materials.endmembers, materials.names) if with_truth else None
     views = ReportViews(materials, evaluation, {"view_0"})
     for index, offset in enumerate(offsets):

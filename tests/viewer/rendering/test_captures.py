@@ -109,14 +109,12 @@ def test_pictures_of_two_pages_are_rendered_in_turn_and_one_that_waits_can_be_ca
     next(first)
     assert captured(services, small)[1][-1] == 1.0
     assert parts[-1] < 1
-    waiting = services.loop.strips(small, Edit(), 1, cancelled, lambda _: cancelled.set())
-    services.loop._queue.append(None)  # of a page that waits longer
+    waiting = services.loop.strips(small, Edit(), 1, cancelled)
     cancelled.set()
     with pytest.raises(ConfigError, match="cancelled"):
         next(waiting)
-    services.loop._queue.remove(None)
-    assert not services.loop._queue
-    assert services.loop._num_blocks == 0
+    next(first)  # which goes on
+    assert captured(services, small)[1][-1] == 1.0
 
 
 def test_pictures_that_would_not_fit_are_refused():
@@ -279,11 +277,12 @@ def test_videos_are_rendered_in_turn_and_can_be_cancelled(tmp_path, run_instead)
     assert third.parts == [1.0]
 
 
-def test_a_render_that_has_just_ended_by_itself_can_be_cancelled():
-    with subprocess.Popen([sys.executable, "-c", ""], text=True, start_new_session=True) as process:
-        process.wait()
-        captures._end(process)
-    assert process.returncode == 0
+def test_a_render_that_has_just_ended_by_itself_can_be_cancelled(tmp_path):
+    job = Ending(tmp_path).job
+    with subprocess.Popen([sys.executable, "-c", ""], text=True, start_new_session=True) as job.process:
+        job.process.wait()
+        VideoQueue().cancel(job)
+    assert job.process.returncode == 0
 
 
 def test_stopping_ends_the_encoder_that_the_render_started(tmp_path, run_instead):
@@ -294,9 +293,9 @@ def test_stopping_ends_the_encoder_that_the_render_started(tmp_path, run_instead
     videos, one = VideoQueue(), Ending(tmp_path)
     videos.start(one.job)
     assert one.begun.wait(120)
-    [thread] = videos._jobs.values()
+    assert videos.is_busy
     videos.stop()
-    assert not thread.is_alive()
+    assert not videos.is_busy
     # Its output is read to the end, which comes only once the encoder, which shares it, has ended.
     assert one.wait() == (None, "cancelled")
     run_instead("print('rendering: 1 of 1 done')")
@@ -307,10 +306,10 @@ def test_stopping_ends_the_encoder_that_the_render_started(tmp_path, run_instead
 
 
 def test_a_video_whose_process_cannot_be_begun_ends_with_the_reason(tmp_path, monkeypatch):
-    def refuse(_):
-        raise OSError("no more processes")
-
-    monkeypatch.setattr("unmix_plugin.viewer.rendering.captures._begin", refuse)
+    monkeypatch.setattr(captures, "child_command", lambda _module, _argv: [str(tmp_path / "no program")])
     one = Ending(tmp_path)
     VideoQueue().start(one.job)
-    assert one.wait() == (None, "rendering the video failed: no more processes")
+    video, reason = one.wait()
+    assert video is None
+    assert reason.startswith("rendering the video failed: ")
+    assert "No such file or directory" in reason

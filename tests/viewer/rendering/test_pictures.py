@@ -1,5 +1,8 @@
 """How fine to render; pictures in blocks are the pictures that a scene renders at once; depth for the browser."""
 
+from dataclasses import replace
+from itertools import pairwise
+
 import numpy as np
 import pytest
 import torch
@@ -7,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.testing import assert_close
 
-from tests.factories.views import make_frame, make_source
+from tests.factories.files import present
+from tests.factories.views import make_frame, make_source, some_pose
 from unmix_plugin.editing import Recipe
 from unmix_plugin.editing.recipe import Gloss, Remove
 from unmix_plugin.trained import gradual
@@ -53,45 +57,58 @@ def test_what_training_changes_later_does_not_change_a_frame(source, model):
 speeds = st.floats(1e3, 1e8)
 
 
+@pytest.fixture(scope="module")
+def maker(tmp_path_factory):
+    return pictures.PictureMaker(make_source(tmp_path_factory.mktemp("run")))
+
+
 @given(speeds, st.floats(0.2, 5), st.integers(16, 2048))
-def test_a_moving_picture_takes_no_longer_than_its_time(speed, aspect, largest):
-    height = pictures._moving_height(speed, aspect, largest)
-    assert 1 <= height <= largest
-    pixels = height * height * aspect
-    assert pixels <= max(speed * pictures._LONGEST_MOVING_S, pictures._FEWEST_PIXELS) * 1.01
-    assert pictures._moving_height(3e7, 1.0, 512) == 512
+def test_a_moving_picture_takes_no_longer_than_its_time(maker, speed, aspect, largest):
+    maker.speed = pictures.Speedometer(speed)
+    render = maker.first_render(replace(some_pose(), aspect=aspect), largest)
+    assert 1 <= render.camera.height <= largest
+    assert render.num_rays <= max(0.07 * speed, 256) * 1.1  # the width is a whole number
+    maker.speed = pictures.Speedometer(3e7)
+    assert maker.first_render(replace(some_pose(), aspect=1.0), 512).camera.height == 512
 
 
 @given(st.integers(1, 512), st.integers(16, 2048))
-def test_pictures_become_finer_until_the_finest_and_then_no_more(start, largest):
-    heights = [min(start, largest)]
-    while (finer := pictures._finer_height(heights[-1], largest)) is not None:
-        assert finer > heights[-1]
-        heights.append(finer)
-    assert heights[-1] == largest
-    assert len(heights) <= 13
+def test_pictures_become_finer_until_the_finest_and_then_no_more(maker, start, largest):
+    pose, frame = some_pose(), make_frame(maker.source)
+    finest = maker.target_height(pose, largest)
+    heights = [min(start, finest)]
+    for _ in range(13):
+        frame = replace(frame, camera=camera_of(pose, heights[-1]))
+        heights.append(maker.finer_render(pose, frame, largest, 1).camera.height)
+    assert heights[-1] == finest
+    assert all(finer > height or finer == height == finest for height, finer in pairwise(heights))
 
 
 def test_a_speedometer_follows_what_is_measured():
-    speed = pictures._Speedometer()
+    speed = pictures.Speedometer()
     for _ in range(30):
         speed.add(1000, 0.01)
     assert speed.rays_per_second == pytest.approx(1e5, rel=0.01)
-    assert speed.block_rays == pytest.approx(1e5 * pictures._BLOCK_S, rel=0.01)
+    assert speed.block_rays == pytest.approx(1e5 * 0.03, rel=0.01)
     before = speed.rays_per_second
     speed.add(0, 1.0)
     speed.add(100, 0.0)
     assert speed.rays_per_second == before
-    assert (pictures._Speedometer(1.0).block_rays, pictures._Speedometer(1e12).block_rays) == (256, 1 << 17)
+    assert (pictures.Speedometer(1.0).block_rays, pictures.Speedometer(1e12).block_rays) == (256, 1 << 17)
 
 
 def test_depth_is_along_the_axis_where_something_is_and_far_elsewhere(source):
     camera = camera_of(pose_of(source.record.train_cameras[0]), 32)
     frame = make_frame(source, camera)
-    depth = pictures._picture_depth(frame)
+    maker = pictures.PictureMaker(source)
+
+    def depth_of(frame):
+        return present(maker.paint(frame, LayerSettings(), True, False).depth)
+
+    depth = depth_of(frame)
     accumulation = frame.coefficients.accumulation.numpy()
     assert depth.shape == (camera.height, camera.width)
-    assert (depth[accumulation <= 0.5] == np.float32(np.round(pictures._FAR / 512e-5) * 512e-5)).all()
+    assert (depth[accumulation <= 0.5] == np.float32(np.round(160 / 512e-5) * 512e-5)).all()
     seen = accumulation > 0.5
     assert seen.any()
     bundle = camera.image_rays(0)
@@ -102,7 +119,7 @@ def test_depth_is_along_the_axis_where_something_is_and_far_elsewhere(source):
     units = np.round(depth.astype(np.float64) * 100_000).astype(np.int64)  # the browser's; low bits are empty
     assert_close(units % 512, np.zeros_like(units))
     fine = make_frame(source, camera_of(pose_of(source.record.train_cameras[0]), 300))  # of every other pixel
-    depth, accumulation = pictures._picture_depth(fine), fine.coefficients.accumulation[1::2, 1::2].numpy()
+    depth, accumulation = depth_of(fine), fine.coefficients.accumulation[1::2, 1::2].numpy()
     assert depth.shape == (150, fine.camera.width // 2)
     assert ((depth > 100) == (accumulation <= 0.5)).all()
 

@@ -44,7 +44,7 @@ def surface_at(
 
 
 @dataclass(frozen=True)
-class _ProbedPoint:
+class ProbedPoint:
     """What one point is made of."""
 
     number: int
@@ -82,9 +82,9 @@ class _ProbedPoint:
         return _COLOURS[(self.number - 1) % len(_COLOURS)]
 
 
-def _take_probe(
+def take_probe(
     maker: PictureMaker, edit: Edit, camera: Cameras, place: tuple[float, float], number: int
-) -> _ProbedPoint:
+) -> ProbedPoint:
     """What is seen at a place of a picture, and what training views measured there."""
     views = maker.aids.measured
     with maker.locked_edit(edit) as (_, shown):
@@ -92,13 +92,13 @@ def _take_probe(
         pixels = () if isinstance(views, str) else views.measured.pixels_that_see(seen[1], shown)
     measured = None if isinstance(views, str) else views.measured.spectra(pixels, shown)
     if measured is None:
-        return _ProbedPoint(number, *seen, shown.materials)
+        return ProbedPoint(number, *seen, shown.materials)
     who = measured.views[0] if len(measured.views) == 1 else f"{len(measured.views)} training views, mean"
     who = f"{who}, before the edits" if edit.recipe.operations else who
-    return _ProbedPoint(number, *seen, shown.materials, measured.mean, who)
+    return ProbedPoint(number, *seen, shown.materials, measured.mean, who)
 
 
-def _spectra_csv(probes: Sequence[_ProbedPoint]) -> bytes:
+def spectra_csv(probes: Sequence[ProbedPoint]) -> bytes:
     """One row a band: wavelength, and for each probe what was predicted and, where known, measured."""
     columns = {"wavelength": probes[0].materials.bands.centers_nm}
     for one in probes:
@@ -109,7 +109,7 @@ def _spectra_csv(probes: Sequence[_ProbedPoint]) -> bytes:
     return csv_bytes([[*columns], *([f"{value:.9g}" for value in row] for row in rows)])
 
 
-def _abundances_csv(probes: Sequence[_ProbedPoint], scale: Scale | None = None) -> bytes:
+def abundances_csv(probes: Sequence[ProbedPoint], scale: Scale | None = None) -> bytes:
     """One row a probe: number, position in the world, metres in a unit of it (empty where unknown), material, the
     training views measured in, what the spectra are, the light lit in place of the recorded one, abundances, each with
     the ends of its 90 % interval, empty where that is not determined."""
@@ -154,7 +154,7 @@ class ProbePanel:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self._probes: list[_ProbedPoint] = []
+        self._probes: list[ProbedPoint] = []
         self._markers: dict[int, viser.IcosphereHandle] = {}
         self._taken = 0
         gui = session.client.gui
@@ -168,7 +168,7 @@ class ProbePanel:
 
     def _take(self, camera: Cameras, place: tuple[float, float]) -> None:
         session = self._session
-        taken = _take_probe(session.services.maker, session.view.edit, camera, place, self._taken + 1)
+        taken = take_probe(session.services.maker, session.view.edit, camera, place, self._taken + 1)
         self._taken += 1
         self._probes.append(taken)
         while len(self._probes) > _MOST_PROBES:
@@ -216,8 +216,8 @@ class ProbePanel:
             raise ConfigError("there is no probe to save; click a point of the picture first")
         folder = self._session.services.folder
         for name, content in (
-            ("probes", _spectra_csv(self._probes)),
-            ("probe-abundances", _abundances_csv(self._probes, self._session.services.source.scale)),
+            ("probes", spectra_csv(self._probes)),
+            ("probe-abundances", abundances_csv(self._probes, self._session.services.source.scale)),
         ):
             path = write_file(new_file(folder, name, ".csv", name), content)
             self._session.client.send_file_download(path.name, content)
@@ -232,7 +232,7 @@ class ProbePanel:
         self._chart.draw()
         self._comparison.draw()
 
-    def _drop(self, one: _ProbedPoint) -> None:
+    def _drop(self, one: ProbedPoint) -> None:
         self._probes.remove(one)
         self._markers.pop(one.number).remove()
 

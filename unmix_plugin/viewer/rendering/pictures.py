@@ -47,7 +47,7 @@ _MEMORY = 0.7
 
 
 @dataclass
-class _Speedometer:
+class Speedometer:
     """Rays a second, as measured recently."""
 
     rays_per_second: float = 20_000.0
@@ -133,7 +133,7 @@ class PictureMaker:
 
     def __init__(self, source: SceneSource) -> None:
         self.source = source
-        self.speed = _Speedometer()
+        self.speed = Speedometer()
         with source.locked() as scene:
             self.layers = layers_of(scene)
             """What can be shown, by name."""
