@@ -32,8 +32,6 @@ PSNR_LOSS = _common.Limit(1.0, is_upper=True, unit=" dB")
 PLAIN_SIZE, PLAIN_BANDS, PLAIN_VIEWS = 320, 12, 36
 RING_ELEVATION_DEG = 28.0
 ANGLES = f"0:360:{360 // PLAIN_VIEWS}"
-RINGS = 3
-"""Heights of the camera in the rendered turntable, in turn; the object is turned by 8 degrees from view to view."""
 BASIL_ANGLES = "0:375:15,0:375:15"
 """Two turns, each a little more than once around; the steps are those of its COLMAP model, which are uneven."""
 WAVELENGTHS = "610,550,465"
@@ -46,7 +44,7 @@ class Options:
     folder: Path
     """Keep captures, scenes, runs and what was measured here."""
     turntable: Path | None = None
-    """A scene of an object on a turntable, views in the order of its frames."""
+    """A scene of an object on a turntable whose axis is z, such as `turntable` of scenes.py."""
     basil: Path | None = None
     """The files of "Basil" of HS-NeRF: images/ and colmap/."""
     steps: int = 600
@@ -208,11 +206,15 @@ def on_turntable(options: Options) -> dict[str, Any]:
     content = json.loads((options.turntable / "transforms.json").read_text(encoding="utf-8"))
     capture.mkdir(exist_ok=True)
     rows = ["view,angle,camera"]
-    for index, frame in enumerate(content["frames"]):
+    places = np.array([frame["transform_matrix"] for frame in content["frames"]])[:, :3, 3]
+    angles = np.degrees(np.arctan2(places[:, 1], places[:, 0])) % 360
+    heights, cameras = np.unique(np.round(places[:, 2], 6), return_inverse=True)
+    print(f"turntable: {len(heights)} heights of the camera", flush=True)
+    for frame, angle, camera in zip(content["frames"], angles - angles[0], cameras, strict=True):
         stem = Path(frame["file_path"]).stem
         shutil.copy(options.turntable / frame["hyperspectral_file_path"], capture / f"{stem}.npy")
         shutil.copy(options.turntable / frame["file_path"], capture / f"{stem}.png")
-        rows.append(f"{stem},{8 * index},{index % RINGS}")
+        rows.append(f"{stem},{angle:.6f},{camera}")
     table = options.folder / "angles.csv"
     table.write_text("\n".join(rows) + "\n", encoding="utf-8")
     given = str(options.turntable / "transforms.json")

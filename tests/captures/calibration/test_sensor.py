@@ -129,6 +129,12 @@ def test_the_end_of_the_detector_is_a_plateau(top: int, facts, part, value: int,
     assert saturation_of(file_of(counts, **facts)).stored == expected
 
 
+@pytest.mark.filterwarnings("error")
+def test_radiance_in_half_precision_is_no_counts():
+    file = file_of(GENERATOR.uniform(0, 1, (16, 16, 6)).astype(np.float16))
+    assert not count_stored([file], np.arange(6)).are_whole
+
+
 @pytest.mark.parametrize(("factor", "expected"), [(1.0, 4095.0), (1e-4, None), (-1.0, None)])
 @pytest.mark.parametrize("dtype", [np.float32, np.int32])
 def test_counts_end_where_the_detector_does_in_wider_numbers_too(dtype, factor: float, expected):

@@ -102,6 +102,10 @@ def test_wrong_angles_are_refused():
     halved = {name: Turn(0.5 * turn.angle_deg) for name, turn in turns.items()}
     with pytest.raises(CaptureError, match="the angles do not explain the pictures"):
         poses_from_turntable(pictures, halved, masks)
+    pictures, turns, masks, _ = turned(knobs(), heights=(6.0,))
+    shuffled = {name: Turn(8.0 * index, index % 3) for index, name in enumerate(turns)}
+    with pytest.raises(CaptureError, match="the angles do not explain the pictures"):
+        poses_from_turntable(pictures, shuffled, masks)
 
 
 def test_angles_are_ranges_one_for_each_place_or_a_table(tmp_path):

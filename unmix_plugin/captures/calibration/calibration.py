@@ -257,6 +257,7 @@ def count_stored(files: Sequence[Cube], bands: np.ndarray) -> StoredCounts:
     varying = bands[np.ptp(known, axis=0) > 0] if len(known) else bands[:0]
     for file, row in product(files, rows) if len(varying) else ():
         stored = _stored_pixels(file, row, varying).ravel()
+        stored = stored.astype(np.float64) if is_wide else stored  # half precision has no 65,535
         if is_wide and not ((stored >= 0) & (stored <= high) & (stored % 1 == 0)).all():
             return StoredCounts(dtype, low, counts, len(known), len(varying), are_whole=False)
         counts += np.bincount(stored.astype(np.int64) - low, minlength=len(counts))

@@ -56,6 +56,8 @@ _PITCH, _AZIMUTH = 1, 4
 _FOCAL_FACTORS = (1.2, 2.0, 3.5, 7.0)
 _PITCHES_DEG = (0.0, 8.0, 16.0, 24.0, 32.0, 40.0, 48.0, 56.0, 64.0, 72.0)
 """How far the camera may look down, to begin with."""
+_STEEPEST = np.radians(85.0)
+"""Of a camera at the beginning; straight above, no distance from the axis tells how far away it is."""
 
 
 def poses_from_turntable(
@@ -372,7 +374,9 @@ def _begin(observed: Observations, focal_px: float, sense: float) -> _Numbers:
         at_place = observed.part(observed.camera == camera)
         best_of(camera, _PITCH, _PITCHES_DEG, at_place)
         start.cameras[camera, :3] = _solve(start, at_place, [camera], steps=8, zoom=False).cameras[camera, :3]
-    pitch = start.cameras[:, _PITCH]
+    # Angles that are wrong may turn a camera over; what then fits badly is refused.
+    pitch = np.clip(start.cameras[:, _PITCH], -_STEEPEST, _STEEPEST)
+    start.cameras[:, _PITCH] = pitch
     distance = 1.0 / np.cos(pitch[0])
     start.cameras[:, 3] = np.log(distance * np.cos(pitch))
     start.cameras[:, 5] = distance * (np.sin(pitch) - np.sin(pitch[0]))
