@@ -19,7 +19,7 @@ from unmix_plugin.engine.processes import ALONE
 from unmix_plugin.engine.runs.load_run import load_pipeline
 from unmix_plugin.products.evaluation import evaluate_scene
 from unmix_plugin.products.product import Job
-from unmix_plugin.products.report.report import _look
+from unmix_plugin.products.report.report import compared_views
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.metrics import psnr
@@ -188,7 +188,7 @@ def test_the_gain_of_a_view_of_a_rig_does_not_count_either_nor_in_a_report(train
     assert seen.figures["psnr"] == pytest.approx(plain.figures["psnr"])
     quiet = (lambda _: None, lambda _: nullcontext(), show)
     job = Job(replace(loaded, scene=fitting), tmp_path, False, *quiet, ALONE)
-    views: Any = _look(job, job.views("eval"), measured)
+    views: Any = compared_views(job, job.views("eval"), measured)
     assert views.evaluation.figures() == pytest.approx(plain.figures)
 
 

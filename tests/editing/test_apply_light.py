@@ -12,7 +12,7 @@ from torch.testing import assert_close
 from tests.factories.edited_scenes import CAMERAS, LIGHT, edited, lit_scene, rendered, tensors_of
 from tests.factories.models import WAVELENGTHS_NM, make_scene
 from unmix_plugin.editing import Light, Recipe, edit_scene
-from unmix_plugin.editing.apply import _retinted, relighting_factors, with_sensor
+from unmix_plugin.editing.apply import relighting_factors, retinted, with_sensor
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import illuminant_power, linear_to_srgb, rgb_matrix, xyz_matrix
@@ -135,8 +135,8 @@ def surface(name):
     return measured_library().reflectance(f"ColorChecker/{name}", VISIBLE, "hold")
 
 
-def retinted(reflectance, linear_rgb, greatest=1.0):
-    return _retinted(VISIBLE, reflectance, TO_RGB, linear_rgb, greatest)
+def recoloured(reflectance, linear_rgb, greatest=1.0):
+    return retinted(VISIBLE, reflectance, TO_RGB, linear_rgb, greatest)
 
 
 @settings(deadline=None, max_examples=40)
@@ -144,16 +144,16 @@ def retinted(reflectance, linear_rgb, greatest=1.0):
 def test_the_colour_of_any_smooth_surface_can_be_given_to_any_other(name, seed):
     g, own = np.random.default_rng(seed), surface(name)
     other = np.interp(VISIBLE.centers_nm, np.linspace(400, 700, 6), g.uniform(0.05, 0.9, 6))
-    changed = retinted(own, other @ TO_RGB)
+    changed = recoloured(own, other @ TO_RGB)
     np.testing.assert_allclose(changed @ TO_RGB, other @ TO_RGB, atol=1e-5)
     assert 0 <= changed.min() <= changed.max() <= 1
-    np.testing.assert_allclose(retinted(own, own @ TO_RGB), own, atol=1e-9)
+    np.testing.assert_allclose(recoloured(own, own @ TO_RGB), own, atol=1e-9)
 
 
 def test_no_random_change_to_the_same_colour_is_smoother():
     """Any admissible change differs from the smoothest by one that has no colour; adding such ones never helps."""
     own = surface("foliage")
-    changed = retinted(own, surface("moderate red") * 0.8 @ TO_RGB)
+    changed = recoloured(own, surface("moderate red") * 0.8 @ TO_RGB)
     width = 10 / 300
 
     def cost(spectrum: np.ndarray) -> float:
@@ -172,7 +172,7 @@ def test_a_change_of_colour_keeps_the_fine_structure_and_leaves_the_infrared_alo
     bands = Bands.of(np.linspace(400, 1000, 121))
     reflectance = np.clip(0.4 + 0.03 * np.sin(bands.centers_nm / 4), 0, 1)
     to_rgb = rgb_matrix(bands, torch.float64).numpy()
-    ratio = _retinted(bands, reflectance, to_rgb, np.array([0.45, 0.35, 0.3])) / reflectance
+    ratio = retinted(bands, reflectance, to_rgb, np.array([0.45, 0.35, 0.3])) / reflectance
     roughness, own = (np.square(np.diff(one, n=2)).sum() for one in (ratio, reflectance))
     assert roughness < 0.1 * own
     assert abs(ratio[-1] - 1) < 0.35 * np.abs(ratio[bands.centers_nm < 700] - 1).max()
@@ -187,7 +187,7 @@ def encoded(linear_rgb: np.ndarray) -> np.ndarray:
 def test_of_a_colour_out_of_reach_the_nearest_is_taken(colour):
     """No random surface within the bounds comes nearer on a display, first order of the sRGB curve aside."""
     wanted = np.array(colour)
-    changed = retinted(surface("red"), wanted, greatest=0.75)
+    changed = recoloured(surface("red"), wanted, greatest=0.75)
     assert 0 <= changed.min() <= changed.max() <= 0.75
     missed = np.linalg.norm(encoded(changed @ TO_RGB) - encoded(wanted))
     assert missed > 0.01
@@ -199,8 +199,8 @@ def test_of_a_colour_out_of_reach_the_nearest_is_taken(colour):
 
 def test_a_higher_bound_reaches_brighter_colours():
     target = np.array([1.2, 1.1, 0.8])
-    assert np.abs(retinted(surface("red"), target) @ TO_RGB - target).max() > 0.05
-    changed = retinted(surface("red"), target, greatest=1.6)
+    assert np.abs(recoloured(surface("red"), target) @ TO_RGB - target).max() > 0.05
+    changed = recoloured(surface("red"), target, greatest=1.6)
     np.testing.assert_allclose(changed @ TO_RGB, target, atol=1e-5)
     assert 1 < changed.max() <= 1.6
 

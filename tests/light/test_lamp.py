@@ -12,7 +12,7 @@ from unmix_plugin.editing.edited_field import EditedField
 from unmix_plugin.engine.geometry.key_poses import rotation_matrix
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.light.lamp import Lamp, MovingLamp
-from unmix_plugin.light.shading import FINEST, Lamplight, ShadowDetail, _visible_part, lamplight
+from unmix_plugin.light.shading import FINEST, Lamplight, ShadowDetail, lamplight, visible_part
 from unmix_plugin.model import UnmixModel
 from unmix_plugin.operators.occupancy import skip_distances
 from unmix_plugin.settings import UnmixModelConfig
@@ -53,7 +53,7 @@ def test_only_in_the_cameras_frame_the_lamp_goes_up_with_the_camera():
 def test_what_stands_before_the_lamp_casts_a_shadow_and_what_stands_behind_does_not():
     positions = torch.tensor([[-0.5, 0.0, 0.5], [-0.5, 0.0, -0.5], [0.99, 0.0, 0.5]])
     lamps = positions + torch.tensor([5.0, 0.0, 0.0])
-    found = _visible_part(positions, lamps, BOX, skip_distances(wall() != 0))
+    found = visible_part(positions, lamps, BOX, skip_distances(wall() != 0))
     assert found[0] < 0.01
     assert_close(found[1:], torch.ones(2))
 
@@ -64,8 +64,8 @@ def test_shadows_come_nearer_and_get_sharper_until_training_ends():
     below = torch.tensor([[0.0, 0.0, -0.2], [0.0, 0.0, -0.7]])
     lamps, skips = below + torch.tensor([0.0, 0.0, 5.0]), skip_distances(plate != 0)
     details = [ShadowDetail.at(progress) for progress in (0.0, 0.5, 1.0)]
-    first, middle, last = (_visible_part(below, lamps, BOX, skips, detail) for detail in details)
-    assert torch.equal(_visible_part(below, lamps, BOX, skips), last)
+    first, middle, last = (visible_part(below, lamps, BOX, skips, detail) for detail in details)
+    assert torch.equal(visible_part(below, lamps, BOX, skips), last)
     assert bool((first > middle).all() & (middle > last).all())
     assert float(last.max()) < 0.05
     assert ShadowDetail.at(1.0) == FINEST

@@ -4,7 +4,7 @@ import pytest
 import torch
 from scipy.ndimage import distance_transform_cdt
 
-from unmix_plugin.operators.occupancy import OccupancyGrid, _VisibleCells, skip_distances
+from unmix_plugin.operators.occupancy import OccupancyGrid, VisibleCells, skip_distances
 
 
 def ball(points: torch.Tensor) -> torch.Tensor:
@@ -121,7 +121,7 @@ SIDE = 8
 ENOUGH_RAYS = 16 * SIDE * SIDE
 
 
-def record(cells: _VisibleCells, *sights, seen: bool = True, num_rays: int = ENOUGH_RAYS) -> None:
+def record(cells: VisibleCells, *sights, seen: bool = True, num_rays: int = ENOUGH_RAYS) -> None:
     """Samples in the middle of cells, each with the number of its view."""
     points = (torch.tensor([cell for cell, _ in sights]) + 0.5) / SIDE
     views = torch.tensor([view for _, view in sights])
@@ -141,7 +141,7 @@ NEAR, FAR = (1, 1, 1), (6, 6, 6)
     ],
 )
 def test_what_two_views_see_stays_with_its_neighbours_and_the_rest_is_closed(sights, unseen, opened, closed):
-    cells = _VisibleCells((SIDE, SIDE, SIDE))
+    cells = VisibleCells((SIDE, SIDE, SIDE))
     for some, seen in ((sights, True), (unseen, False)):
         if some:
             record(cells, *some, seen=seen)
@@ -153,7 +153,7 @@ def test_what_two_views_see_stays_with_its_neighbours_and_the_rest_is_closed(sig
 @pytest.mark.parametrize("more", [0, 1])
 def test_nothing_is_left_out_before_enough_rays_were_cast(more):
     """Of which large pictures need more, and views may have large numbers."""
-    cells = _VisibleCells((SIDE, SIDE, SIDE))
+    cells = VisibleCells((SIDE, SIDE, SIDE))
     record(cells, (NEAR, 1000), (NEAR, 1001), num_rays=ENOUGH_RAYS - 1 + more)
     cells.update(fewest_rays=ENOUGH_RAYS + more)
     assert cells.visible.all()
@@ -163,7 +163,7 @@ def test_nothing_is_left_out_before_enough_rays_were_cast(more):
 
 
 def test_only_what_was_seen_since_the_last_update_counts_and_the_open_cells_follow_a_surface():
-    cells = _VisibleCells((SIDE, SIDE, SIDE))
+    cells = VisibleCells((SIDE, SIDE, SIDE))
     for x in (3, 4):
         record(cells, ((x, 3, 3), 0), ((x, 3, 3), 1))
         cells.update()
@@ -173,7 +173,7 @@ def test_only_what_was_seen_since_the_last_update_counts_and_the_open_cells_foll
 
 
 def test_points_on_the_faces_of_the_box_belong_to_the_outermost_cells():
-    cells = _VisibleCells((SIDE, SIDE, SIDE))
+    cells = VisibleCells((SIDE, SIDE, SIDE))
     corners = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]).repeat(2, 1)
     cells.record(corners, torch.tensor([0, 0, 1, 1]), torch.ones(4, dtype=torch.bool), ENOUGH_RAYS)
     cells.update()

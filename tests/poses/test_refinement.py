@@ -22,7 +22,7 @@ from unmix_plugin.field import CoefficientField
 from unmix_plugin.model import UnmixModel
 from unmix_plugin.poses import refinement as pose_refinement
 from unmix_plugin.poses.knots import Knots, row_waves
-from unmix_plugin.poses.refinement import LARGEST_RATIO, LARGEST_STEP, PoseRefinement, _RobustWeights
+from unmix_plugin.poses.refinement import LARGEST_RATIO, LARGEST_STEP, PoseRefinement, RobustWeights
 from unmix_plugin.sensors.views import MeasuredPixels
 from unmix_plugin.settings import PoseConfig
 
@@ -252,9 +252,9 @@ def test_levels_without_weight_change_nothing():
 KNOTS = 10
 
 
-def observed(errors: torch.Tensor, matter: torch.Tensor | None = None) -> _RobustWeights:
+def observed(errors: torch.Tensor, matter: torch.Tensor | None = None) -> RobustWeights:
     """After steps in which each knot had one pixel with this error."""
-    robust = _RobustWeights(len(errors))
+    robust = RobustWeights(len(errors))
     shown = torch.ones(len(errors), dtype=torch.bool) if matter is None else matter
     for _ in range(20):
         robust.update(torch.arange(len(errors)), errors, shown)
@@ -288,7 +288,7 @@ def test_a_pose_that_fits_again_is_an_inlier_again():
     assert_close(robust.weights, torch.ones(KNOTS))
     broken = observed(torch.cat([torch.ones(KNOTS - 1), torch.tensor([torch.nan])]))
     assert_close(broken.weights, torch.ones(KNOTS))
-    unseen = _RobustWeights(KNOTS)
+    unseen = RobustWeights(KNOTS)
     unseen.judge(Processes())
     assert_close(unseen.weights, torch.ones(KNOTS))
 

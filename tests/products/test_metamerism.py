@@ -12,7 +12,7 @@ from PIL import Image
 
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.products import metamerism
-from unmix_plugin.products.metamerism import _find_metamers, export
+from unmix_plugin.products.metamerism import export, find_metamers
 from unmix_plugin.products.product import Job
 from unmix_plugin.products.scene_products import Metamerism
 from unmix_plugin.spectral.bands import Bands
@@ -58,7 +58,7 @@ def known(monkeypatch):
 
 
 def pairs_of(materials=MATERIALS, **asked):
-    found = _find_metamers(materials, Metamerism(lights=BOTH, **asked))
+    found = find_metamers(materials, Metamerism(lights=BOTH, **asked))
     return [{found.names[pair.first], found.names[pair.second]} for pair in found.pairs]
 
 
@@ -97,14 +97,14 @@ def test_bands_that_no_eye_sees_play_no_part(known):
     greys = (LibraryMaterial(name, bands, np.full(2, 0.4), "test") for name, bands in ends.items())
     known[0] = MaterialLibrary((*greys, *LIBRARY.materials))
     materials = Materials(wide, spectra, torch.zeros(0, 61), names=MATERIALS.names, light=light)
-    found = _find_metamers(materials, Metamerism(lights=BOTH))
+    found = find_metamers(materials, Metamerism(lights=BOTH))
     assert found.bands == Bands.of(np.linspace(400, 780, 39))
     assert "own/to 790" in found.names
     assert "own/to 600" not in found.names  # which does not reach all bands
     assert {"slate", "paint"} in pairs_of(materials)
     infrared = Bands.of(np.linspace(800, 1000, 61))
     with pytest.raises(SpectrumError, match="no visible light"):
-        _find_metamers(Materials(infrared, spectra, torch.zeros(0, 61)), Metamerism(lights=BOTH))
+        find_metamers(Materials(infrared, spectra, torch.zeros(0, 61)), Metamerism(lights=BOTH))
 
 
 @pytest.mark.parametrize("dark", [0.0, 1e-5])
@@ -114,7 +114,7 @@ def test_bands_that_the_scenes_light_leaves_dark_play_no_part(dark):
     spectra = torch.tensor(np.stack([GREY, LIBRARY.materials[0].reflectance]) * light + 1e-4).float()
     lit = {"names": ("slate", "a"), "light": torch.tensor(light).float()}
     materials = Materials(BANDS, spectra, torch.zeros(0, 31), **lit)
-    found = _find_metamers(materials, Metamerism(lights=BOTH))
+    found = find_metamers(materials, Metamerism(lights=BOTH))
     assert found.bands == Bands.of(np.linspace(440, 700, 27))
     own, same = (found.reflectance[found.names.index(name)] for name in ("a", "own/a"))
     np.testing.assert_allclose(own, same, atol=0.01)

@@ -23,7 +23,7 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import KeyPoses
 from unmix_plugin.engine.processes import ALONE
 from unmix_plugin.products import views
-from unmix_plugin.products.endmembers import _endmember_paths, write_endmembers
+from unmix_plugin.products.endmembers import write_endmembers
 from unmix_plugin.products.poses import export as export_poses
 from unmix_plugin.products.product import Job, Product
 from unmix_plugin.products.scene_products import Abundances, Cubes, Poses, Segmentation
@@ -46,7 +46,10 @@ def job_of(scene, folder, say=lambda _: None):
 
 def test_spectral_python_opens_the_endmembers_as_a_library(tmp_path):
     write_endmembers(tmp_path, MATERIALS, around_endmembers(MATERIALS))
-    assert sorted(tmp_path.glob("[!.]*")) == sorted(_endmember_paths(tmp_path))
+    kinds = (".csv", "-intervals.csv", ".hdr", ".sli", ".png")
+    assert sorted(path.name for path in tmp_path.glob("[!.]*")) == sorted(
+        f"endmembers{kind}" for kind in kinds
+    )
     library: Any = envi.open(str(tmp_path / "endmembers.hdr"), str(tmp_path / "endmembers.sli"))
     assert library.names == list(MATERIALS.names)
     np.testing.assert_array_equal(library.spectra, MATERIALS.endmembers.numpy())

@@ -9,7 +9,7 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import KeyPoses
 from unmix_plugin.poses.refinement import LARGEST_STEP
 from unmix_plugin.spectral.sensor import SceneSensor
-from unmix_plugin.trained.alignment import _moved, align_pose, align_rows
+from unmix_plugin.trained.alignment import align_pose, align_rows, moved_camera
 from unmix_plugin.trained.evaluation import ViewTruth
 
 POSE = torch.tensor([[[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4.0]]])
@@ -20,7 +20,7 @@ OFF = torch.tensor([0.02, -0.015, 0.02, 0.01, 0.02, -0.01])
 
 
 def turned(angle: float) -> torch.Tensor:
-    return _moved(CAMERA, torch.tensor([angle, 0.0, 0.0, 0.0, 0.0, 0.0]), SCENE).camera_to_world
+    return moved_camera(CAMERA, torch.tensor([angle, 0.0, 0.0, 0.0, 0.0, 0.0]), SCENE).camera_to_world
 
 
 def swept() -> Cameras:
@@ -46,14 +46,14 @@ def off_by(found: Cameras, truth: Cameras) -> float:
 
 @pytest.mark.parametrize(("camera", "share"), [(CAMERA, 1.0), (swept(), 0.4), (CAMERA, 0.0)])
 def test_a_view_that_is_off_by_pixels_is_brought_back_and_one_that_is_right_stays(camera, share):
-    given = _moved(camera, share * OFF, SCENE)
+    given = moved_camera(camera, share * OFF, SCENE)
     before = off_by(given, camera)
     assert before > 1.0 or share == 0
     assert off_by(align_pose(SCENE, given, truth_of(SCENE, camera)), camera) < max(0.1 * before, 0.05)
 
 
 def test_a_view_that_is_off_by_a_quarter_of_its_width_is_brought_back_too():
-    given = _moved(CAMERA, torch.tensor([-0.1, 0.12, 0.1, 0.0, 0.0, 0.0]), SCENE)
+    given = moved_camera(CAMERA, torch.tensor([-0.1, 0.12, 0.1, 0.0, 0.0, 0.0]), SCENE)
     assert off_by(given, CAMERA) > 7
     assert off_by(align_pose(SCENE, given, truth_of(SCENE, CAMERA)), CAMERA) < 0.5
 
@@ -66,7 +66,7 @@ THREE = SceneSensor("three", np.eye(5)[[3, 0, 2]])
     [(1.0, 1.6, THREE), (0.0, 0.6, None)],
 )
 def test_where_gains_are_fitted_no_pose_makes_up_for_another_exposure(share, exposure, sensor):
-    fitting, given = replace(SCENE, fitted=("pose", "gain")), _moved(CAMERA, share * OFF, SCENE)
+    fitting, given = replace(SCENE, fitted=("pose", "gain")), moved_camera(CAMERA, share * OFF, SCENE)
     truth = replace(truth_of(SCENE, CAMERA), sensor=sensor)
     found = align_pose(fitting, given, replace(truth, spectra=exposure * truth.seen(truth.spectra)))
     assert off_by(found, CAMERA) < max(0.1 * off_by(given, CAMERA), 0.05)
@@ -86,7 +86,7 @@ def swept_rows(wobble: float) -> Cameras:
     for row in y.tolist():
         turn = [0.2 - 0.4 * row / 32, 0.0, wobble * float(torch.sin(torch.tensor(0.3 * row)))]
         turn[1] = wobble * float(torch.cos(torch.tensor(0.25 * row)))
-        poses.append(_moved(CAMERA, torch.tensor([*turn, 0.0, 0.0, 0.0]), SCENE).camera_to_world)
+        poses.append(moved_camera(CAMERA, torch.tensor([*turn, 0.0, 0.0, 0.0]), SCENE).camera_to_world)
     return replace(CAMERA, key_poses=KeyPoses(torch.cat(poses), y, (32,)))
 
 

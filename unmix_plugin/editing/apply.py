@@ -127,7 +127,7 @@ _EXACTNESS = 1e5
 """Weight of the colour against smoothness; the error of the colour falls with its square."""
 
 
-def _retinted(
+def retinted(
     bands: Bands,
     reflectance: Float64[np.ndarray, " B"],
     to_rgb: Float64[np.ndarray, "B 3"],
@@ -252,7 +252,7 @@ def _retint(state: MaterialState, edit: Retint, where: str) -> None:
     light = np.where(is_lit, state.light, 0.0)
     reflectance = np.where(is_lit, state.spectra[index] / np.where(is_lit, light, 1.0), 0.0)
     to_rgb, wanted = light[:, None] * _rgb_matrix(state), shown.full_colour(edit.colour)
-    changed = _retinted(state.bands, reflectance, to_rgb, wanted, shown.greatest_reflectance)
+    changed = retinted(state.bands, reflectance, to_rgb, wanted, shown.greatest_reflectance)
     state.spectra[index] = changed * light
     what = state.names[index] if seen is None else f"pictures of {state.names[index]}"
     reached = _reached_colour(state, f"{where}: {what}", edit.colour, shown.mean_srgb(changed @ to_rgb))
@@ -314,7 +314,7 @@ def _gloss(state: MaterialState, edit: Gloss, where: str) -> None:
     chosen = range(len(state.names)) if edit.endmember is None else [state.index_of(edit.endmember)]
     if edit.colour is not None and edit.colour not in state.mirror_reflectances:
         white, to_rgb = np.ones(len(state.bands)), _rgb_matrix(state)
-        mirror = _retinted(state.bands, white, to_rgb, _IN_FULL_LIGHT.full_colour(edit.colour))
+        mirror = retinted(state.bands, white, to_rgb, _IN_FULL_LIGHT.full_colour(edit.colour))
         state.mirror_reflectances[edit.colour] = mirror
         shown = _IN_FULL_LIGHT.mean_srgb(mirror @ to_rgb)
         state.mirror_colours[edit.colour] = _reached_colour(state, f"{where}: highlights", edit.colour, shown)

@@ -241,26 +241,24 @@ def lamplight(
     towards = normalize(fixed - positions, dim=-1)
     if generator is None:
         corners = spread * positions.new_tensor([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
-        parts = [_visible_part(positions, fixed + corner, box, skips, detail) for corner in corners]
+        parts = [visible_part(positions, fixed + corner, box, skips, detail) for corner in corners]
         return Lamplight(torch.stack(parts).mean(dim=0), towards)
     drawn = torch.randn(positions.shape, generator=generator, device=generator.device)
     offsets = spread * drawn.to(positions)
-    one, other = (
-        _visible_part(positions, fixed + shift, box, skips, detail) for shift in (offsets, -offsets)
-    )
+    one, other = (visible_part(positions, fixed + shift, box, skips, detail) for shift in (offsets, -offsets))
     # Stein's identity: the mean of these slopes is the gradient of the visible part, blurred over the points.
     slopes = ((one - other) / (2 * spread**2))[:, None] * offsets
     return Lamplight((one + other) / 2 + (slopes * (middle - fixed)).sum(dim=-1), towards)
 
 
 @torch.no_grad()
-def _visible_part(
+def visible_part(
     positions: Vectors, lamps: Vectors, box: SceneBox, skips: Skips, detail: ShadowDetail = FINEST
 ) -> Values:
     """Part of the light from points outside the box that the box lets through to each position."""
     if len(positions) > _SHADOWS_AT_ONCE:
         parts = zip(positions.split(_SHADOWS_AT_ONCE), lamps.split(_SHADOWS_AT_ONCE), strict=True)
-        return torch.cat([_visible_part(*part, box, skips, detail) for part in parts])
+        return torch.cat([visible_part(*part, box, skips, detail) for part in parts])
     towards = normalize(lamps - positions, dim=-1)
     cell = float((box.size / torch.tensor(skips.shape, device=box.size.device)).max())
     t_far = box.intersect(positions, towards)[1]

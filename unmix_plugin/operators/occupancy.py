@@ -70,7 +70,7 @@ _NO_VIEW = 255
 """Views are told apart by their number modulo this, which takes one byte a cell and leaves this number for none."""
 
 
-class _VisibleCells(nn.Module):
+class VisibleCells(nn.Module):
     """Cells that two training views have seen, by the rays cast since the last update."""
 
     visible: Bool[Tensor, "X Y Z"]
@@ -157,7 +157,7 @@ class OccupancyGrid(nn.Module):
         opaque, none at the start, where some cast shadows; and what densities rays meet, so that updates need not probe
         those cells, where that is recorded."""
         super().__init__()
-        self.visibility = _VisibleCells(reachable.shape)
+        self.visibility = VisibleCells(reachable.shape)
         self.register_buffer("reachable", reachable.clone())
         self.register_buffer("peak_densities", torch.full(reachable.shape, torch.inf))
         self.register_buffer("occupied", reachable.to(torch.uint8))

@@ -67,7 +67,7 @@ _FEWEST_PIXELS = 3.0
 _LEAST_WEIGHT = 1e-4
 
 
-class _RobustWeights(nn.Module):
+class RobustWeights(nn.Module):
     """Errors of the pixels around each knot, and what these pixels weigh; all 1 at first."""
 
     squares: Tensor
@@ -152,7 +152,7 @@ class PoseRefinement(nn.Module):
         total = int(counts.sum())
         self.steps = nn.Parameter(torch.zeros(total, 6))
         self.lens = _LensRefinement(lens)
-        self.robust = _RobustWeights(total)
+        self.robust = RobustWeights(total)
         self.register_buffer("reach", torch.ones(total))
         self.register_buffer("scale", torch.ones(total))
         self.register_buffer("bound", torch.full((total,), LARGEST_STEP))

@@ -57,7 +57,7 @@ def export(job: Job, asked: Metamerism) -> list[Path]:
     if asked.surfaces != "library" and not job.materials.is_light_known:
         job.say(LIGHT_UNKNOWN)
     with job.working("comparing colours"):
-        found = _find_metamers(job.materials, asked)
+        found = find_metamers(job.materials, asked)
         rows = [
             [
                 "first",
@@ -79,7 +79,7 @@ def export(job: Job, asked: Metamerism) -> list[Path]:
     return written
 
 
-def _find_metamers(materials: Materials, asked: Metamerism) -> _Metamers:
+def find_metamers(materials: Materials, asked: Metamerism) -> _Metamers:
     kept = materials.bands.visible_mask & materials.is_lit.cpu().numpy()
     if not kept.any():
         raise SpectrumError(f"{materials.bands} hold no visible light, so nothing is known of metamerism")

@@ -123,7 +123,7 @@ def align_pose(scene: TrainedScene, camera: Cameras, truth: ViewTruth) -> Camera
         if side == _SIDES_PX[0]:
             step = _best_start(comparison)
         step = comparison.fit(step, count)
-    return _moved(camera, step, scene)
+    return moved_camera(camera, step, scene)
 
 
 def _best_start(comparison: _Comparison) -> Float[Tensor, "6"]:
@@ -239,7 +239,7 @@ class _Comparison:
         is_coarse = self.block == 1 and max(self.camera.width, self.camera.height) <= _SIDES_PX[0]
         subpixels = 2 if is_coarse else 1
         height, width = subpixels * self.camera.height, subpixels * self.camera.width
-        cameras = [_moved(self.camera, step, self.scene) for step in steps]
+        cameras = [moved_camera(self.camera, step, self.scene) for step in steps]
         rays = [camera.resized(width, height).to(self.scene.device).image_rays(0) for camera in cameras]
         found = composite(self.scene.renderer, self.scene.field, RayBundle.join(rays))
         view = MaterialView(self.scene, cameras[0], found.unflatten(len(cameras) * height, width))
@@ -262,7 +262,7 @@ class _Comparison:
         return float(self.residuals(step[None]).square().sum())
 
 
-def _moved(camera: Cameras, step: Float[Tensor, "6"], scene: TrainedScene) -> Cameras:
+def moved_camera(camera: Cameras, step: Float[Tensor, "6"], scene: TrainedScene) -> Cameras:
     """A camera that is turned about itself and shifted, by a share of its distance to the scene's middle."""
     middle = scene.scene_box.aabb.mean(dim=0).to(camera.camera_to_world)
     reach = (camera.camera_to_world[0, :, 3] - middle).norm()

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from torch.testing import assert_close
 
 from unmix_plugin.neumatex.fit import tone
-from unmix_plugin.neumatex.fit.tone import LampRatio, SpectralDisplay, _CameraResponse, tone_curve
+from unmix_plugin.neumatex.fit.tone import CameraResponse, LampRatio, SpectralDisplay, tone_curve
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb
 
@@ -24,14 +24,14 @@ def test_curves_increase_for_greys_and_stay_in_0_to_1(name):
 @pytest.mark.parametrize("name", ["linear", "srgb", "agx", "learnt"])
 def test_slopes_are_those_of_differences(name):
     light = torch.tensor([[0.05, 0.18, 0.6], [0.3, 0.9, 0.02]], dtype=torch.float64)
-    curve = _CameraResponse().double() if name == "learnt" else tone_curve(name)
+    curve = CameraResponse().double() if name == "learnt" else tone_curve(name)
     assert torch.autograd.gradcheck(curve, light.requires_grad_())
 
 
 @settings(deadline=None, max_examples=30)
 @given(st.lists(st.floats(-5, 5), min_size=tone.NUM_COEFFICIENTS, max_size=tone.NUM_COEFFICIENTS))
 def test_any_coefficients_give_a_curve_that_increases_from_0_to_1(coefficients):
-    response = _CameraResponse()
+    response = CameraResponse()
     response.coefficients.data = torch.tensor(coefficients)
     numbers = response(torch.linspace(0, 1, 500)[:, None])[:, 0].detach()
     assert numbers[0] == pytest.approx(0, abs=1e-3)
@@ -53,7 +53,7 @@ def test_an_unknown_curve_and_exposure_are_found_from_light_and_numbers(curve):
     generator = torch.Generator().manual_seed(3)
     light = torch.rand(2000, 3, generator=generator) ** 2
     measured = curve(light)
-    response = _CameraResponse()
+    response = CameraResponse()
     optimizer = torch.optim.Adam(response.parameters(), lr=0.05)
     for _ in range(400):
         optimizer.zero_grad()

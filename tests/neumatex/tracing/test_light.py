@@ -11,7 +11,7 @@ from tests.factories.surfaces import generator, unit
 from unmix_plugin.errors import SceneError, SpectrumError
 from unmix_plugin.formats.exr import write_exr, write_spectral_exr
 from unmix_plugin.neumatex.tracing.built_in_lights import NAMES, built_in_environment
-from unmix_plugin.neumatex.tracing.environment import Environment, _PictureInversion, directions_of_pixels
+from unmix_plugin.neumatex.tracing.environment import Environment, PictureInversion, directions_of_pixels
 from unmix_plugin.neumatex.tracing.light_files import of_lamp, read_environment, read_lamp
 from unmix_plugin.spectral.bands import Bands
 
@@ -31,7 +31,7 @@ def test_pixels_are_drawn_by_their_weights_and_evenly_within(weights):
     given = torch.tensor(weights)
     axis = (torch.arange(600, dtype=torch.float64) + 0.5) / 600
     grid = torch.stack(torch.meshgrid(axis, axis, indexing="ij"), dim=-1).reshape(-1, 2)
-    row, column, down, across = _PictureInversion(given.double()).draw(grid)
+    row, column, down, across = PictureInversion(given.double()).draw(grid)
     drawn = torch.zeros_like(given, dtype=torch.float64)
     drawn.index_put_((row, column), torch.ones_like(down), accumulate=True)
     assert_close(drawn / len(grid), given.double() / given.double().sum(), atol=3e-3, rtol=0)

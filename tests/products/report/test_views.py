@@ -14,13 +14,14 @@ from PIL import Image
 from tests.factories.pages import Outline, assert_self_contained
 from unmix_plugin.figures.look import NEUTRAL
 from unmix_plugin.formats.files import eight_bits
+from unmix_plugin.formats.html import picture_url
 from unmix_plugin.products.report.pictures import (
     ReportViews,
     TrueMaterials,
     material_cards,
     segmentation_section,
 )
-from unmix_plugin.products.report.report import _figure_rows, _png_url, _render_page, _view_values
+from unmix_plugin.products.report.report import figure_rows, render_page, view_values
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.material_library import measured_library
 from unmix_plugin.spectral.materials import Materials
@@ -63,7 +64,7 @@ TEXTS = {"title": "Title <x>", "subtitle": "run", "notes": ["so & so"], "facts":
 
 
 def outline(views: ReportViews, **others) -> Outline:
-    return assert_self_contained(_render_page({**NOTHING, **TEXTS, **_view_values(views), **others}))
+    return assert_self_contained(render_page({**NOTHING, **TEXTS, **view_values(views), **others}))
 
 
 def shown_texts(views: ReportViews, **others) -> dict[str, str]:
@@ -79,7 +80,7 @@ def test_error_against_wavelength_and_proportions_are_over_pixels_that_show_matt
     assert gathered([]).proportions.tolist() == [0, 0, 0]
     texts = shown_texts(views)
     assert "mean of predicted less measured" in texts["error"]
-    assert len(_view_values(views)["segmentation"]["pictures"]) == 2 * 3
+    assert len(view_values(views)["segmentation"]["pictures"]) == 2 * 3
     assert texts["segmentation"].count("1.000") == 3  # as matched with the labels
     assert "<clay>" in texts["segmentation"]
 
@@ -118,7 +119,7 @@ def test_there_is_a_map_for_each_endmember_in_the_views_chosen(count):
     view = PredictedView(shares @ materials.endmembers, torch.ones(4, 5), shares, ids, shares)
     views.add("first", view, None)
     views.add("second", view, None)
-    [(name, maps)] = _view_values(views)["shares"]
+    [(name, maps)] = view_values(views)["shares"]
     assert name == "second"
     assert [one.caption for one in maps] == list(materials.names)
     text = shown_texts(views)["abundances"]
@@ -153,7 +154,7 @@ def test_each_endmember_has_the_known_materials_that_it_is_like_and_its_true_one
 
 
 def test_figures_come_with_their_definitions_or_with_what_to_do():
-    rows = _figure_rows({"ssim": 0.9, "psnr": 31.25, "miou": None, "definitions": {"psnr": "as it was then"}})
+    rows = figure_rows({"ssim": 0.9, "psnr": 31.25, "miou": None, "definitions": {"psnr": "as it was then"}})
     assert [name for name, *_ in rows] == ["psnr", "ssim"]
     others = {"num_main": 1, "unknown": ["miou"], "figures_source": "From a file."}
     text = shown_texts(gathered([]), figures=rows, **others)["figures"]
@@ -164,7 +165,7 @@ def test_figures_come_with_their_definitions_or_with_what_to_do():
 
 def test_a_picture_holds_its_pixels_and_a_large_one_is_shrunk():
     def decoded(pixels: np.ndarray) -> np.ndarray:
-        data = base64.b64decode(_png_url(pixels).removeprefix("data:image/png;base64,"))
+        data = base64.b64decode(picture_url(pixels, 640).removeprefix("data:image/png;base64,"))
         return np.asarray(Image.open(io.BytesIO(data)))
 
     pixels = np.random.default_rng(0).integers(0, 256, (5, 7, 3)).astype(np.uint8)

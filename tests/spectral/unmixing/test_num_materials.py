@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from tests.factories.mixtures import mixed_pixels, seeded, smooth_endmembers, surface_pixels
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.noise import estimate_noise
-from unmix_plugin.spectral.unmixing.num_materials import _elbow, hysime, propose_num_materials
+from unmix_plugin.spectral.unmixing.num_materials import elbow, hysime, propose_num_materials
 
 
 def gaussian(shape, deviation, seed=0):
@@ -59,7 +59,7 @@ def test_the_elbow_is_where_a_further_material_helps_little():
         (0.2, 0.1, 0.006, 0.0021): 3,
         (0.2, 0.1, 0.05, 0.02): 4,
     }
-    assert {distances: _elbow(distances) for distances in elbows} == elbows
+    assert {distances: elbow(distances) for distances in elbows} == elbows
 
 
 @settings(max_examples=15)

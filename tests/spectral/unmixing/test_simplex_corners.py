@@ -49,8 +49,8 @@ def test_noise_is_estimated_and_the_projection_takes_it_out_of_the_chosen_pixels
     noise = torch.randn(many.shape, generator=seeded(1), dtype=torch.float64)
     for true_db in (10.0, 25.0, 40.0):
         scaled = noise * math.sqrt(float(many.square().mean()) / 10 ** (true_db / 10))
-        assert abs(simplex_corners._estimated_snr_db(many + scaled, 4) - true_db) < 0.3
-    assert simplex_corners._estimated_snr_db(many, 4) == math.inf
+        assert abs(simplex_corners.estimated_snr_db(many + scaled, 4) - true_db) < 0.3
+    assert simplex_corners.estimated_snr_db(many, 4) == math.inf
     clean, places = scene(3)
     noisy = clean + 0.02 * torch.randn(clean.shape, generator=seeded(4), dtype=torch.float64)
     found, indices = vca(noisy, 3, seeded())

@@ -33,7 +33,7 @@ _DARK = 0.25
 """Brightness, as a part of the mean, far below which pixels count alike."""
 
 
-class _CameraResponse(nn.Module):
+class CameraResponse(nn.Module):
     """One increasing curve for all colours, and the exposure before it."""
 
     mean: Tensor
@@ -106,7 +106,7 @@ class _FixedCurve(nn.Module):
 
 def tone_curve(name: ToneMapping) -> nn.Module:
     """The curve of that name; only `camera` has parameters."""
-    return _CameraResponse() if name == "camera" else _FixedCurve(name)
+    return CameraResponse() if name == "camera" else _FixedCurve(name)
 
 
 def psnr_db(squared_error: Float[Tensor, "*pixels"]) -> Float[Tensor, ""]:

@@ -39,6 +39,9 @@ _RIDGE = 0.02
 """Variance that is added to that of the light in a fit, so that light that hardly varies explains little."""
 
 
+_LEAST_ALPHA = 0.9
+
+
 @dataclass(frozen=True)
 class PosedViews:
     """Pictures with their cameras; sizes may differ."""
@@ -54,6 +57,21 @@ class PosedViews:
         """Some of the views, in the order asked for."""
         chosen = [self.pictures[index] for index in indices], [self.alphas[index] for index in indices]
         return PosedViews(self.cameras[indices], *chosen)
+
+    def at(self, positions: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N V 3"], Bool[Tensor, "N V"]]:
+        """Colours of points in each picture, bilinear, and whether the object is there."""
+        colours, shown = [], []
+        for index, (picture, alpha) in enumerate(zip(self.pictures, self.alphas, strict=True)):
+            pixels, depths = self.cameras.project(positions, index)
+            size = pixels.new_tensor([picture.shape[1], picture.shape[0]])
+            places = (2 * pixels / size - 1)[None, None]
+            planes = torch.cat([picture, alpha[..., None]], dim=-1).permute(2, 0, 1)[None]
+            found = functional.grid_sample(planes, places, padding_mode="zeros", align_corners=False)[
+                0, :, 0
+            ].T
+            colours.append(found[:, :3])
+            shown.append((depths > 0) & (found[:, 3] >= _LEAST_ALPHA))
+        return torch.stack(colours, dim=1), torch.stack(shown, dim=1)
 
 
 def well_spread(positions: Float[Tensor, "V 3"], count: int) -> list[int]:

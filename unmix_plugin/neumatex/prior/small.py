@@ -63,7 +63,7 @@ _RATE, _SHRINKAGE = 0.05, 1e-4
 """Of the fit of planes; shrinkage pulls texels that hardly a point reads to 0."""
 _MOST_VIEWS = 12
 """Views that are used; of more, those whose directions are farthest apart."""
-_NUM_POINTS, _LEAST_ALPHA = 3072, 0.9
+_NUM_POINTS = 3072
 
 
 class SmallPrior(nn.Module):
@@ -215,7 +215,7 @@ def _observe(
     points = sample_surface(ray_mesh.mesh, _NUM_POINTS, generator)
     eyes = views.cameras.camera_to_world[:, :, 3]
     known = known_light(points, eyes, ray_mesh, environment, generator)
-    colours, shown = _read_colours(views, points.positions)
+    colours, shown = views.at(points.positions)
     visible = known.visible & shown
     if not bool(visible.any()):
         raise SceneError(
@@ -226,22 +226,6 @@ def _observe(
     mean = environment.mean_radiance().mean().clamp(min=1e-12)
     colours = torch.where(visible[..., None], colours / mean, 0.0)
     return replace(known, colours=colours, visible=visible).alone()
-
-
-def _read_colours(
-    views: PosedViews, positions: Float[Tensor, "N 3"]
-) -> tuple[Float[Tensor, "N V 3"], Bool[Tensor, "N V"]]:
-    """Colours of points in each picture, bilinear, and whether the object is there."""
-    colours, shown = [], []
-    for index, (picture, alpha) in enumerate(zip(views.pictures, views.alphas, strict=True)):
-        pixels, depths = views.cameras.project(positions, index)
-        size = pixels.new_tensor([picture.shape[1], picture.shape[0]])
-        places = (2 * pixels / size - 1)[None, None]
-        planes = torch.cat([picture, alpha[..., None]], dim=-1).permute(2, 0, 1)[None]
-        found = functional.grid_sample(planes, places, padding_mode="zeros", align_corners=False)[0, :, 0].T
-        colours.append(found[:, :3])
-        shown.append((depths > 0) & (found[:, 3] >= _LEAST_ALPHA))
-    return torch.stack(colours, dim=1), torch.stack(shown, dim=1)
 
 
 def read_small_prior(material: MaterialName, folder: Path = SHIPPED) -> SmallPrior:

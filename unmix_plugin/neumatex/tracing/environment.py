@@ -104,8 +104,8 @@ class Environment:
         return weights if bool(weights.sum() > 0) else self._solid_angles[:, None].expand_as(grey)
 
     @cached_property
-    def _pixels(self) -> _PictureInversion:
-        return _PictureInversion(self._weights)
+    def _pixels(self) -> PictureInversion:
+        return PictureInversion(self._weights)
 
     @cached_property
     def _densities(self) -> Float64[Tensor, "H W"]:
@@ -130,7 +130,7 @@ def directions_of_pixels(height: int, width: int) -> Float[Tensor, "H W 3"]:
     return torch.stack([flat * azimuth.cos(), flat * azimuth.sin(), polar.cos()], dim=-1).float()
 
 
-class _PictureInversion:
+class PictureInversion:
     """Pixels drawn by their weights, by inversion of cumulative shares."""
 
     def __init__(self, weights: Float64[Tensor, "H W"]) -> None:

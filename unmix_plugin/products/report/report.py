@@ -11,13 +11,13 @@ from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime, timezone
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
 import numpy as np
-from jaxtyping import Float, UInt8
 
 from unmix_plugin import __version__
 from unmix_plugin.engine.runs.config_json import config_to_json
@@ -73,7 +73,7 @@ def export(job: Job, asked: Report) -> list[Path]:
         )
     else:
         scene = job.measured_scene(asked.data)
-    views = _look(job, chosen, scene)
+    views = compared_views(job, chosen, scene)
     if len(chosen) < len(job.loaded.record.eval_cameras):
         notes.append(f"Rendered: {len(chosen)} of {len(job.loaded.record.eval_cameras)} evaluation views.")
     run = job.loaded.folder.path
@@ -92,11 +92,11 @@ def export(job: Job, asked: Report) -> list[Path]:
         values = {**_page(job, views, known, about), "notes": notes, "regions": regions}
         values["unexplained"], scale = unexplained or ([], None)
         values["unexplained_scale"] = None if scale is None else (scale, scale_strip(scale, 220, 12))
-        page = _render_page(values).encode("utf-8", "backslashreplace")
+        page = render_page(values).encode("utf-8", "backslashreplace")
         return [write_file(job.folder / "report.html", page)]
 
 
-def _look(job: Job, chosen: Sequence[RunView], scene: Scene | None) -> ReportViews:
+def compared_views(job: Job, chosen: Sequence[RunView], scene: Scene | None) -> ReportViews:
     """Render the views, and compare each with what was measured, if the scene folder is found and unchanged; aligned
     first, as unmix-eval does."""
     materials, evaluation = job.materials, None
@@ -145,7 +145,7 @@ def _page(job: Job, views: ReportViews, library: MaterialLibrary, about: Mapping
     truth = _true_materials(loaded, light)
     cards = material_cards(materials, views.proportions, light, library, truth)
     unknown = [name for name in DEFINITIONS if figures is not None and figures.get(name, 0) is None]
-    rows = _figure_rows(figures or {})
+    rows = figure_rows(figures or {})
     return {
         "title": about.get("title") or f"{loaded.scene_name}: materials and spectra",
         "subtitle": f"{loaded.config.method_name}, run {loaded.folder.path.name}",
@@ -163,11 +163,11 @@ def _page(job: Job, views: ReportViews, library: MaterialLibrary, about: Mapping
         "figures_source": source,
         "settings": json.dumps(config_to_json(replace(loaded.config, load_run=None)), indent=1),
         "versions": _version_rows(loaded),
-        **_view_values(views),
+        **view_values(views),
     }
 
 
-def _view_values(views: ReportViews) -> dict[str, Any]:
+def view_values(views: ReportViews) -> dict[str, Any]:
     """What the template shows of views."""
     shown, worst = evenly(views.shown, pictures.SHOWN_VIEWS), views.worst_first
     colour = describe_colour(views.materials.bands)
@@ -210,18 +210,18 @@ _LARGEST_SIDE_PX = 640
 """Larger pictures are shrunk, as a page would show them."""
 
 
-def _render_page(values: Mapping[str, Any]) -> str:
+def render_page(values: Mapping[str, Any]) -> str:
     """The template filled in; text is escaped."""
 
     def svg_url(chart: SpectraChart) -> str:
         return f"data:image/svg+xml;base64,{base64.b64encode(draw_chart(chart)).decode()}"
 
-    filters = {"css": css_colour, "png": _png_url, "svg": svg_url}
+    filters = {
+        "css": css_colour,
+        "png": partial(picture_url, largest_side_px=_LARGEST_SIDE_PX),
+        "svg": svg_url,
+    }
     return fill_template("unmix_plugin.products.report", "report.html", values, filters)
-
-
-def _png_url(image: Float[np.ndarray, "H W 3"] | UInt8[np.ndarray, "H W 3"]) -> str:
-    return picture_url(image, _LARGEST_SIDE_PX)
 
 
 _PACKAGES = ("torch", "warp-lang", "numpy", "scipy", "scikit-image", "colour-science", "matplotlib", "pillow")
@@ -296,7 +296,7 @@ def _about(run: RunFolder, asked: Report) -> dict[str, str]:
     return about
 
 
-def _figure_rows(values: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+def figure_rows(values: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     """Each figure of merit that is known, as `eval/metrics.json` has it, with its definition; the main ones first."""
     definitions = {**DEFINITIONS, **(values.get("definitions") or {})}
     return [

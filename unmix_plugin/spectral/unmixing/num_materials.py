@@ -72,13 +72,13 @@ def propose_num_materials(pixels: Float[Tensor, "N B"], generator: torch.Generat
     noise = _noise_distance(pixels) if is_enough else 0.0
     # Distances in independent directions add as squares.
     distances = tuple(math.sqrt(max(fit.mean_distance**2 - noise**2, 0.0)) for fit in fits)
-    return _MaterialCount(_elbow(distances), distances, noise, hysime(pixels) if is_enough else None)
+    return _MaterialCount(elbow(distances), distances, noise, hysime(pixels) if is_enough else None)
 
 
-def _elbow(mean_distances: tuple[float, ...]) -> int:
+def elbow(mean_distances: tuple[float, ...]) -> int:
     """The number of materials after which a further one helps little, by the distances with 1, 2, ... of them.
 
-    >>> _elbow((0.20, 0.08, 0.03, 0.027, 0.026))
+    >>> elbow((0.20, 0.08, 0.03, 0.027, 0.026))
     3
     """
     number = 1

@@ -64,7 +64,7 @@ def vca(
         )
     data = pixels.double()
     if snr_db is None:
-        snr_db = _estimated_snr_db(data, num_endmembers)
+        snr_db = estimated_snr_db(data, num_endmembers)
     project = _on_components if snr_db < 15 + 10 * math.log10(num_endmembers) else _on_plane
     denoised, points = project(data, num_endmembers)
     indices = _extreme_points(points, generator)
@@ -171,7 +171,7 @@ def _with_best_corner(lifted: Tensor, indices: Tensor, corner: int) -> Tensor:
     return replaced
 
 
-def _estimated_snr_db(data: Float[Tensor, "N B"], num_endmembers: int) -> float:
+def estimated_snr_db(data: Float[Tensor, "N B"], num_endmembers: int) -> float:
     """Signal to noise ratio in dB, the power inside K principal dimensions against the rest; infinite without noise.
 
     Nascimento and Bioucas-Dias 2005, equation 13, with the mean's power counted as signal.
