@@ -255,10 +255,20 @@ class GridPoints:
 
     def slice_points(self, index: int) -> Float[Tensor, "Y Z 3"]:
         """Points of the slice at `index` along x."""
+        return self.slab_points(range(index, index + 1))[0]
+
+    def slab_points(self, indices: range) -> Float[Tensor, "X Y Z 3"]:
+        """Points of some slices along x."""
         _, num_y, num_z = self.shape
-        cells = torch.cartesian_prod(torch.tensor([index]), torch.arange(num_y), torch.arange(num_z))
+        cells = torch.cartesian_prod(torch.tensor(indices), torch.arange(num_y), torch.arange(num_z))
         points = torch.from_numpy(self.origin).double() + self.cell * cells
-        return points.float().view(num_y, num_z, 3)
+        return points.float().view(len(indices), num_y, num_z, 3)
+
+    def slabs(self, most_points: int) -> list[range]:
+        """Slices along x, as many at a time as hold at most so many points, but at least one."""
+        num_x, num_y, num_z = self.shape
+        thickness = max(1, most_points // (num_y * num_z))
+        return [range(begin, min(begin + thickness, num_x)) for begin in range(0, num_x, thickness)]
 
 
 @torch.no_grad()

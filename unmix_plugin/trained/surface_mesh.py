@@ -34,6 +34,8 @@ SMOOTHING_PX = 0.75
 """Standard deviation of the blur; sharp edges get as round as this."""
 _COARSER, _NEAR = 4, 0.5
 """Cells of the grid that are one of a coarse one; the part of the reach within which distances are measured finely."""
+_POINTS_AT_ONCE = 1 << 20
+"""Of the grid, as far as whole slices allow."""
 _RINGS = 4
 """Neighbours over which normals are smoothed."""
 _HEALED_RINGS = 3
@@ -190,22 +192,23 @@ def _distances_on(
 
     coarse = GridPoints.over(scene.scene_box.aabb, max(8, (max(grid.shape) - 1) // _COARSER))
     reach, wide = (max(_REACH_PX, _REACH_CELLS * one.cell / scene.pixel_size) for one in (grid, coarse))
-    slices = [
-        seen.signed_distance(coarse.slice_points(index).flatten(0, 1), wide, is_closed)
-        for index in range(coarse.shape[0])
-    ]
-    first = torch.stack(slices).view(coarse.shape).numpy()
-    found = []
-    for index in follow("measuring distances to the surface", range(grid.shape[0])):
-        points = grid.slice_points(index).flatten(0, 1)
+    first = torch.cat(
+        [
+            seen.signed_distance(coarse.slab_points(slab).flatten(0, 2), wide, is_closed)
+            for slab in coarse.slabs(_POINTS_AT_ONCE)
+        ]
+    )
+    first, found = first.view(coarse.shape).numpy(), np.empty(grid.shape, np.float32)
+    for slab in follow("measuring distances to the surface", grid.slabs(_POINTS_AT_ONCE)):
+        points = grid.slab_points(slab).flatten(0, 2)
         parts = map_coordinates(
             first, ((points.numpy() - coarse.origin) / coarse.cell).T, order=1, mode="nearest"
         )
         near = np.abs(parts) < _NEAR
         parts = (parts * (wide / reach)).clip(-1, 1)
         parts[near] = seen.signed_distance(points[torch.from_numpy(near)], reach, is_closed).numpy()
-        found.append(reach * parts.reshape(grid.shape[1:]))
-    return np.stack(found)
+        found[slab.start : slab.stop] = reach * parts.reshape(len(slab), *grid.shape[1:])
+    return found
 
 
 def without_stray_pieces(mesh: TriangleMesh) -> TriangleMesh:
