@@ -50,7 +50,7 @@ from unmix_plugin.operators.occupancy import OccupancyGrid
 from unmix_plugin.poses.refinement import PoseRefinement
 from unmix_plugin.poses.training import CorrectedRays, PoseTraining
 from unmix_plugin.presets import fill_auto, preset_for
-from unmix_plugin.rendering.front_to_back import composite_view
+from unmix_plugin.rendering.front_to_back import composite_view, evenly_in_pixel
 from unmix_plugin.rendering.grid_upkeep import GRID_INTERVAL, update_grid
 from unmix_plugin.rendering.renderer import RenderedRays, VolumeRenderer
 from unmix_plugin.sensors.views import BandBalance, MeasuredPixels, SensorViews, ViewGains, from_batch
@@ -364,7 +364,7 @@ class UnmixModel(Model):
 
         For evaluation while training; `trained.TrainedScene` has all other outputs.
         """
-        seen = composite_view(self.renderer, self.field, camera, self.metadata["subpixels"])
+        seen = composite_view(self.renderer, self.field, camera, evenly_in_pixel(self.metadata["subpixels"]))
         linear = self.materials.through(seen, self.rgb_weights).clamp(0, 1)
         found = {
             "spectral": self.materials.spectra(seen),

@@ -59,6 +59,22 @@ def test_a_scene_says_what_training_fitted_for_each_view_and_with_which_gain_it_
     assert_close(found.view_gains, expected)
 
 
+def test_pixels_have_the_rays_of_training_and_two_where_they_are_finer_than_any_measured_one():
+    scene = replace(scene_of(model_with()), subpixels=2)
+    own = scene.views[0].camera
+
+    def looked(factor: float, subpixels: int | None = None):
+        camera = own.resized(round(factor * own.width), round(factor * own.height))
+        return scene.look(camera, subpixels).coefficients.packed
+
+    for factor in (0.5, 1.0, 1.5):
+        torch.testing.assert_close(looked(factor), looked(factor, 2), rtol=0, atol=0)
+    ends = looked(2.0), looked(2.0, 2), looked(2.0, 1)
+    assert all((ends[0] - other).abs().max() > 0 for other in ends[1:])
+    # Two rays tell what four do better than one.
+    assert (ends[0] - ends[1]).square().mean() < (ends[2] - ends[1]).square().mean()
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     return make_scene(tmp_path_factory.mktemp("scene") / "ball").root

@@ -12,6 +12,7 @@ Notation: `R` rays, `A` active ones, `M` samples of each that are marched at onc
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
 
@@ -74,20 +75,32 @@ class _ActiveRays:
         return _ActiveRays(*map(torch.cat, zip(own, further, strict=True)))
 
 
+DIAGONAL = ((0.25, 0.25), (0.75, 0.75))
+"""Places in a pixel, x and y: the least that softens edges of all directions."""
+
+
+def evenly_in_pixel(subpixels: int) -> tuple[tuple[float, float], ...]:
+    """Places in a pixel: middles of so many parts along each of its edges."""
+    middles = [(i + 0.5) / subpixels for i in range(subpixels)]
+    return tuple((x, y) for y in middles for x in middles)
+
+
 @torch.no_grad()
 def composite_view(
-    renderer: VolumeRenderer, field: CoefficientField, camera: Cameras, subpixels: int = 1
+    renderer: VolumeRenderer,
+    field: CoefficientField,
+    camera: Cameras,
+    places: Sequence[tuple[float, float]] = ((0.5, 0.5),),
 ) -> Coefficients:
-    """Coefficients (H, W, ...) of a whole view of one camera: every picture of it follows from them. So many rays
-    pass a pixel along each of its edges and are averaged: all outputs but ratios are linear."""
+    """Coefficients (H, W, ...) of a whole view of one camera: every picture of it follows from them. Rays through these
+    places of each pixel are averaged: all outputs but ratios are linear."""
     camera = camera.to(renderer.skips.device)
-    centres = [(i + 0.5) / subpixels for i in range(subpixels)]
     total: Coefficients | None = None
-    for offset in [(x, y) for y in centres for x in centres]:
-        found = composite(renderer, field, camera.image_rays(0, offset))
+    for place in places:
+        found = composite(renderer, field, camera.image_rays(0, place))
         total = found if total is None else found.map(total.packed.add_)
     assert total is not None
-    return total.map(lambda packed: packed / subpixels**2).unflatten(camera.height, camera.width)
+    return total.map(lambda packed: packed / len(places)).unflatten(camera.height, camera.width)
 
 
 @torch.no_grad()

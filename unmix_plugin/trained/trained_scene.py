@@ -8,6 +8,7 @@ Notation: `H x W` pixels, `B` bands, `K` endmembers.
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from dataclasses import field as dataclass_field
@@ -23,7 +24,7 @@ from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
 from unmix_plugin.engine.outputs import Output
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.field import CoefficientField
-from unmix_plugin.rendering.front_to_back import composite_view
+from unmix_plugin.rendering.front_to_back import DIAGONAL, composite_view, evenly_in_pixel
 from unmix_plugin.rendering.renderer import VolumeRenderer
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.bands import Bands
@@ -280,9 +281,14 @@ class TrainedScene:
         return found
 
     def look(self, camera: Cameras, subpixels: int | None = None) -> MaterialView:
-        """Render a view; `subpixels` squared rays a pixel, None for as many as in training."""
-        count = self.subpixels if subpixels is None else subpixels
-        return MaterialView(self, camera, composite_view(self.renderer, self.field, camera, count))
+        """Render a view; `subpixels` squared rays a pixel, None for as many as in training, but two at most where
+        pixels are half as wide as the finest that were measured, or less: rays are as close as there."""
+        places = evenly_in_pixel(self.subpixels if subpixels is None else subpixels)
+        if subpixels is None and len(places) > len(DIAGONAL):
+            measured = max((float(view.camera.focal_px.max()) for view in self.views), default=math.inf)
+            is_fine = float(camera.focal_px.min()) >= 2 * measured
+            places = DIAGONAL if is_fine else places
+        return MaterialView(self, camera, composite_view(self.renderer, self.field, camera, places))
 
     def render(self, camera: Cameras, names: Collection[str]) -> dict[str, Tensor]:
         """Outputs of a view by name, (H, W, ...); an unknown one is refused before anything is rendered."""
