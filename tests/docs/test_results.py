@@ -27,7 +27,6 @@ DEPENDS = module_of(ROOT / "benchmarks/_depends.py")
 CHECK = module_of(ROOT / "scripts/check_results.py")
 TABLE = module_of(ROOT / "scripts/results_table.py")
 TO_MEASURE_AGAIN = {
-    "found_poses": "python benchmarks/found_poses.py --folder DIR",
     "gpu": "python benchmarks/gpu.py",
 }
 """Results that are not clean, each with the command that measures it again. No other may join them."""
