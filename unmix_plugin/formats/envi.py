@@ -13,7 +13,7 @@ import csv
 import glob
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -108,8 +108,10 @@ def read_header(path: Path) -> dict[str, str]:
         ) from error
 
 
-def header_begins(begin: bytes) -> bool:
-    """Whether the first bytes of a file are those of a header."""
+def is_envi_header(path: Path) -> bool:
+    """Whether a file of any name begins as a header does."""
+    with path.open("rb") as file:
+        begin = file.read(32)
     return re.match(r"ENVI\s", decode_text(begin[: len(begin) // 2 * 2])) is not None
 
 
@@ -262,7 +264,10 @@ def data_beside(header_path: Path, needed_bytes: int, first: str = "") -> Path:
     candidates = dict.fromkeys(base.with_name(base.name + suffix) for suffix in suffixes)
     if base.suffix:  # x.raw.hdr beside x.RAW
         candidates |= {base.with_suffix(base.suffix.upper()): None}
-    found = _distinct_files(path for path in candidates if path != header_path)
+    found: list[Path] = []
+    for path in candidates:  # each once: disks that ignore case have one file under `x.img` and `x.IMG`
+        if path != header_path and path.is_file() and not any(path.samefile(other) for other in found):
+            found.append(path)
     if not found and needed_bytes:  # any other file of this name will do if it has just the size
         others = sorted(header_path.parent.glob(f"{glob.escape(base.name)}.*"))
         found = [path for path in others if path.is_file() and path.stat().st_size == needed_bytes]
@@ -278,15 +283,6 @@ def data_beside(header_path: Path, needed_bytes: int, first: str = "") -> Path:
         names = " and ".join(path.name for path in alike)
         raise ValueError(f"{names} could each be what it describes; name one, or move the others away")
     return chosen
-
-
-def _distinct_files(paths: Iterable[Path]) -> list[Path]:
-    """Those that are files, each once: disks that ignore case have one file under `x.img` and `x.IMG`."""
-    found: list[Path] = []
-    for path in paths:
-        if path.is_file() and not any(path.samefile(other) for other in found):
-            found.append(path)
-    return found
 
 
 def envi_cube_paths(path_without_suffix: Path) -> list[Path]:

@@ -25,7 +25,7 @@ from unmix_plugin.engine.runs.atomic_files import (  # noqa: F401 - some of them
     write_errors_as,
     write_file,
 )
-from unmix_plugin.engine.runs.replacing import refuse_foreign
+from unmix_plugin.engine.runs.replacing import hash_of, refuse_foreign  # noqa: F401 - one of them for others, too
 from unmix_plugin.engine.tables import csv_bytes  # noqa: F401 - for others, who take it from here
 from unmix_plugin.errors import ConfigError
 

@@ -45,6 +45,11 @@ class _Similarity:
     def _undo(self, points: Float[np.ndarray, "*points 3"]) -> Float64[np.ndarray, "*points 3"]:
         return (points / self.scale - self.translation) @ self.rotation + self.offset
 
+    def moved(self, poses: Float64[np.ndarray, "*n 3 4"]) -> Float64[np.ndarray, "*n 3 4"]:
+        """Poses, camera to world, in the space that it leads to."""
+        positions = self._apply(poses[..., 3])
+        return np.concatenate([self.rotation @ poses[..., :3], positions[..., None]], axis=-1)
+
 
 _Triple: TypeAlias = tuple[float, float, float]
 
@@ -94,11 +99,6 @@ class Normalisation(_Similarity):
     def to_world(self, points: Float[np.ndarray, "*points 3"]) -> Float64[np.ndarray, "*points 3"]:
         """Model points in world space, the inverse of `to_model`."""
         return self._undo(points)
-
-    def poses_to_model(self, poses: Float64[np.ndarray, "n 3 4"]) -> Float64[np.ndarray, "n 3 4"]:
-        """World poses, camera to world, in model space."""
-        positions = self.to_model(poses[:, :, 3])
-        return np.concatenate([self.rotation @ poses[:, :, :3], positions[:, :, None]], axis=-1)
 
     def after(self, placement: Placement) -> Normalisation:
         """From the source's world to model space, where this one starts from the space of transforms.json."""

@@ -86,13 +86,8 @@ class PosedCamera:
 
     def moved(self, placement: Placement) -> PosedCamera:
         """The camera in the world that a similarity leads to."""
-
-        def move(poses: Float64[np.ndarray, "*n 3 4"]) -> Float64[np.ndarray, "*n 3 4"]:
-            places = placement.to_scene(poses[..., 3])
-            return np.concatenate([placement.rotation @ poses[..., :3], places[..., None]], axis=-1)
-
-        lines = None if self.lines is None else move(self.lines)
-        return replace(self, camera_to_world=move(self.camera_to_world), lines=lines)
+        lines = None if self.lines is None else placement.moved(self.lines)
+        return replace(self, camera_to_world=placement.moved(self.camera_to_world), lines=lines)
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,9 @@ from unmix_plugin.errors import CaptureError
 from unmix_plugin.formats.envi import (
     MAP_KEYS,
     data_beside,
-    header_begins,
     header_beside,
     image_size,
+    is_envi_header,
     read_header,
     read_layout,
 )
@@ -38,12 +38,6 @@ run_subtract_darkframes, and ARSF, apl."""
 _LINE_RATES = ("fps", "framerate")
 _OF_RESONON = {"shutter", "gain", "framerate"}
 _OF_BANDS = ("wavelength", "wavelength units", "fwhm", "bbl", "band names")
-
-
-def is_envi_header(path: Path) -> bool:
-    """Whether a file of any name begins as a header does."""
-    with path.open("rb") as file:
-        return header_begins(file.read(32))
 
 
 def open_envi(path: Path, _: ReadOptions) -> Cube:

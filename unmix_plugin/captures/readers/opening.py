@@ -26,7 +26,6 @@ from unmix_plugin.captures.readers.derived import said_of_mosaic, take_apart
 from unmix_plugin.captures.readers.envi import (
     described_by_header,
     described_image,
-    is_envi_header,
     open_envi,
 )
 from unmix_plugin.captures.readers.exr import open_exr
@@ -35,7 +34,7 @@ from unmix_plugin.captures.readers.pictures import open_picture
 from unmix_plugin.captures.readers.tiff import open_tiff
 from unmix_plugin.captures.report import Code, Kind, Remark, sentences
 from unmix_plugin.errors import CaptureError
-from unmix_plugin.formats.envi import header_beside
+from unmix_plugin.formats.envi import header_beside, is_envi_header
 from unmix_plugin.limits import open_regular, open_zip
 
 _BEGINNINGS = {

@@ -33,7 +33,7 @@ from unmix_plugin.engine.runs.replacing import (
 )
 from unmix_plugin.engine.runs.run_folder import RunLock
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.scenes.reading.faults import sha256_of
+from unmix_plugin.formats.files import hash_of
 
 RECORD_NAME = "process.json"
 """How a scene was made: in each that this command wrote."""
@@ -211,7 +211,7 @@ def hashes(paths: Iterable[Path]) -> list[dict[str, Any]]:
     found = []
     for file in _files_of(paths):
         with reading(file):
-            found.append({"path": os.fspath(file), "bytes": file.stat().st_size, "sha256": sha256_of(file)})
+            found.append({"path": os.fspath(file), "bytes": file.stat().st_size, "sha256": hash_of(file)})
     return found
 
 

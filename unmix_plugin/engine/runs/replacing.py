@@ -59,7 +59,7 @@ def hash_of(path: Path) -> str:
 
 def is_ours(path: Path) -> bool:
     """Whether `path` is a regular file that its folder's list names with the hash that it has. Raises OSError."""
-    return _is_regular(path) and _is_listed(path, _read_list(path.parent))
+    return os.path.lexists(path) and not foreign([path])
 
 
 def foreign(paths: Iterable[Path]) -> list[Path]:
@@ -70,7 +70,8 @@ def foreign(paths: Iterable[Path]) -> list[Path]:
         if os.path.lexists(path):
             if path.parent not in lists:
                 lists[path.parent] = _read_list(path.parent)
-            if not (_is_regular(path) and _is_listed(path, lists[path.parent])):
+            hashes = lists[path.parent].get(path.name, ())
+            if not (hashes and _is_regular(path) and hash_of(path) in hashes):
                 found.append(path)
     return found
 
@@ -237,7 +238,10 @@ def move_files(built: Path, folder: Path, last: str) -> None:
     """
     files = sorted(path.relative_to(built) for path in _files_below(built))
     folders = sorted({folder / file.parent for file in files})
-    refuse_foreign([*(folder / file for file in files), *(one for one in folders if _is_odd(one, folder))])
+    links = [
+        one for one in folders if one != folder and (one.is_symlink() or (one.exists() and not one.is_dir()))
+    ]
+    refuse_foreign([*(folder / file for file in files), *links])
     for one in sorted({folder, *folders}):
         one.mkdir(exist_ok=True)
     remove(folder / last)
@@ -246,11 +250,6 @@ def move_files(built: Path, folder: Path, last: str) -> None:
         remove(*(one / name for name in listed if (one / name).relative_to(folder) not in files))
     for file in sorted(files, key=lambda file: file == Path(last)):
         put_in_place(built / file, folder / file)
-
-
-def _is_odd(path: Path, root: Path) -> bool:
-    """Whether something that is no folder has a folder's name below `root`."""
-    return path != root and os.path.lexists(path) and (path.is_symlink() or not path.is_dir())
 
 
 def require_apart(replaced: Iterable[Path], read: Iterable[tuple[str, Path]]) -> None:
@@ -265,17 +264,13 @@ def require_apart(replaced: Iterable[Path], read: Iterable[tuple[str, Path]]) ->
     """
     there = [folder for folder in replaced if folder.exists()]
     for what, path in read:
+        resolved = path.resolve()
+        around = [one for one in (resolved, *resolved.parents) if one.exists()] if path.exists() else []
         for folder in there:
-            if path.exists() and _is_within(path, folder):
+            if any(one.samefile(folder) for one in around):
                 raise ConfigError(
                     f"{what} {path} lies in {folder}, which would be replaced; choose another --output-dir"
                 )
-
-
-def _is_within(path: Path, folder: Path) -> bool:
-    """Whether a path is a folder, or lies in it."""
-    resolved = path.resolve()
-    return any(one.exists() and one.samefile(folder) for one in (resolved, *resolved.parents))
 
 
 def _files_below(folder: Path) -> Iterator[Path]:
@@ -313,11 +308,6 @@ def _read_list(folder: Path) -> Mapping[str, set[str]]:
             if parted and len(hashed) == 64:
                 found.setdefault(os.fsdecode(name), set()).add(hashed.decode("ascii", "replace"))
     return found
-
-
-def _is_listed(path: Path, listed: Mapping[str, set[str]]) -> bool:
-    """Whether a regular file has one of the hashes that the list gives it."""
-    return path.name in listed and hash_of(path) in listed[path.name]
 
 
 def _name_exclusively(temporary: Path, path: Path) -> None:

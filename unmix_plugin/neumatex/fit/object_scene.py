@@ -21,6 +21,7 @@ from jaxtyping import Float64
 
 from unmix_plugin.engine import Decision
 from unmix_plugin.errors import SceneError
+from unmix_plugin.formats.files import hash_of
 from unmix_plugin.formats.json_values import describe
 from unmix_plugin.limits import MOST_TEXT_BYTES, read_bounded
 from unmix_plugin.neumatex.fit import checks
@@ -33,7 +34,7 @@ from unmix_plugin.neumatex.tracing.rays import RayMesh
 from unmix_plugin.scenes.placement import Placement
 from unmix_plugin.scenes.reading.cubes import UnreadableArrayError, map_array
 from unmix_plugin.scenes.reading.entries import SceneEntry, read_entries
-from unmix_plugin.scenes.reading.faults import FILE_NAME, Faults, resolve_path, sha256_of
+from unmix_plugin.scenes.reading.faults import FILE_NAME, Faults, resolve_path
 from unmix_plugin.scenes.reading.loader import read_endmembers
 from unmix_plugin.scenes.reading.splits import Split, split_frames
 from unmix_plugin.scenes.scene import Normalisation
@@ -201,7 +202,7 @@ def load_object(
         lamp=power,
         true_materials=true_materials,
         abundance_files=abundance_files,
-        input_hashes={**{path.name: sha256_of(path) for path in files}, **pictures.hashes},
+        input_hashes={**{path.name: hash_of(path) for path in files}, **pictures.hashes},
         notes=tuple(notes),
         decisions=decisions,
     )

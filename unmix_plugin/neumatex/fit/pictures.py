@@ -15,11 +15,12 @@ from jaxtyping import Bool, Float32
 
 from unmix_plugin.engine import Cameras
 from unmix_plugin.errors import CaptureError, SceneError
+from unmix_plugin.formats.files import hash_of
 from unmix_plugin.neumatex.fit.tone import ToneMapping
 from unmix_plugin.neumatex.tracing.light_files import read_exr, require_light
 from unmix_plugin.scenes.reading.cubes import UnreadableArrayError, map_array, read_array_header
 from unmix_plugin.scenes.reading.entries import FrameEntry, SceneEntry, at_sizes
-from unmix_plugin.scenes.reading.faults import Faults, resolve_path, sha256_of
+from unmix_plugin.scenes.reading.faults import Faults, resolve_path
 from unmix_plugin.scenes.reading.images import UnreadableImageError, read_colour, read_mask
 from unmix_plugin.scenes.reading.loader import distinct_names
 from unmix_plugin.scenes.scene import Normalisation
@@ -179,7 +180,7 @@ class PosedPictures:
     def hashes(self) -> dict[str, str]:
         """SHA-256 of each file, by its picture's name and what else it holds of it."""
         return {
-            f"{name}{what}": sha256_of(path)
+            f"{name}{what}": hash_of(path)
             for name, files in zip(self.names, self.files, strict=True)
             for what, path in (("", files.colours), (" alpha", files.opacity), (" mask", files.mask))
             if path is not None

@@ -30,7 +30,7 @@ from PIL import Image
 from unmix_plugin.engine import Decision, TrainerConfig
 from unmix_plugin.errors import ConfigError, SceneError
 from unmix_plugin.formats.exr import write_spectral_exr
-from unmix_plugin.formats.files import make_folder, safe_name, write_file
+from unmix_plugin.formats.files import hash_of, make_folder, safe_name, write_file
 from unmix_plugin.formats.meshes import write_ply
 from unmix_plugin.neumatex.fit.data_manager import ObjectDataManagerConfig, PixelList
 from unmix_plugin.neumatex.fit.object_scene import DECISIONS_FILE, LIGHT_UNKNOWN, load_posed_object
@@ -41,7 +41,7 @@ from unmix_plugin.neumatex.tracing.light_files import ENVIRONMENT_SUFFIXES, read
 from unmix_plugin.neumatex.tracing.rays import RayMesh
 from unmix_plugin.scenes.demo.scene import written_once
 from unmix_plugin.scenes.folder import METRES_KEY, load_transforms, read_scene_keys, transforms_bytes
-from unmix_plugin.scenes.reading.faults import FILE_NAME, Faults, resolve_path, sha256_of
+from unmix_plugin.scenes.reading.faults import FILE_NAME, Faults, resolve_path
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.settings import UnmixModelConfig
 from unmix_plugin.spectral.bands import Bands
@@ -81,7 +81,7 @@ class ObjectRecipe:
         """All that a change of makes another folder, as JSON has it."""
         table = Path(self.lamp) if self.lamp is not None and Path(self.lamp).is_file() else None
         files = {"mesh": self.mesh, "environment": self.environment, "lamp": table}
-        given = {name: None if path is None else sha256_of(path) for name, path in files.items()}
+        given = {name: None if path is None else hash_of(path) for name, path in files.items()}
         given = {**given, "named lamp": self.lamp}
         step = loaded.training.steps
         scene = loaded.record.summary.get("input_hashes")

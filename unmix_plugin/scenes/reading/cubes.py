@@ -20,10 +20,11 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from unmix_plugin.errors import name_some
+from unmix_plugin.formats.files import hash_of
 from unmix_plugin.scenes.folder import CUBE_KEY
 from unmix_plugin.scenes.messages import Message
 from unmix_plugin.scenes.reading.entries import FrameEntry, Shape
-from unmix_plugin.scenes.reading.faults import Faults, sha256_of
+from unmix_plugin.scenes.reading.faults import Faults
 from unmix_plugin.settings import SceneOptions
 
 READ_HEADER = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
@@ -189,7 +190,7 @@ def _measure_cube(path: Path, options: SceneOptions, where: str = "") -> _CubeVa
     num_nan, num_infinite, num_negative, num_far_negative, num_above_one = totals.tolist()
     return _CubeValues(
         where=where,
-        sha256=sha256_of(path),
+        sha256=hash_of(path),
         num_values=cube.size,
         num_pixels=invalid.size,
         is_integer=cube.dtype.kind in "iu",

@@ -81,9 +81,7 @@ class SceneEntry:
         """Cameras of all frames, of images of these sizes, where there are no faults; `normalisation` leads from the
         space of transforms.json to that of the cameras."""
         cameras = [frame.camera for frame in self.frames]
-        return make_cameras(
-            cameras, [(width, height) for height, width in sizes], normalisation.poses_to_model
-        )
+        return make_cameras(cameras, [(width, height) for height, width in sizes], normalisation.moved)
 
 
 def read_entries(root: Path, faults: Faults, needs_cubes: bool = True) -> SceneEntry:

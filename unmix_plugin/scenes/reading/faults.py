@@ -3,7 +3,6 @@ scene names, of unknown origin, which may be followed."""
 
 from __future__ import annotations
 
-import hashlib
 import re
 import time
 import unicodedata
@@ -156,12 +155,3 @@ def resolve_path(
         advice = f"copy the file into it{'' if allow_outside is None else or_allow}"
         return faults.note(where, Message.PATH_OUTSIDE, path=text, advice=advice)
     return faults.note(where, Message.PATH_NO_FILE if path.exists() else Message.PATH_MISSING, path=text)
-
-
-def sha256_of(path: Path) -> str:
-    """SHA-256 of a file of any size, read in small blocks."""
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while block := file.read(1 << 20):
-            digest.update(block)
-    return digest.hexdigest()

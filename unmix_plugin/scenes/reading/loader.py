@@ -14,12 +14,13 @@ from jaxtyping import Float64
 
 from unmix_plugin.engine.runs.atomic_files import NOT_PORTABLE, safe_name
 from unmix_plugin.errors import SpectrumError
+from unmix_plugin.formats.files import hash_of
 from unmix_plugin.scenes.folder import CUBE_KEY
 from unmix_plugin.scenes.kept import judged_once
 from unmix_plugin.scenes.messages import Message
 from unmix_plugin.scenes.reading.checks import CheckedFiles, check_frames
 from unmix_plugin.scenes.reading.entries import SceneEntry, at_sizes, locate_files, read_entries
-from unmix_plugin.scenes.reading.faults import FILE_NAME, Faults, resolve_path, sha256_of
+from unmix_plugin.scenes.reading.faults import FILE_NAME, Faults, resolve_path
 from unmix_plugin.scenes.reading.model_space import ModelSpace, find_model_space, without_far_off
 from unmix_plugin.scenes.reading.splits import Split, split_frames
 from unmix_plugin.scenes.scene import Frame, Scene
@@ -141,7 +142,7 @@ def _assemble(
             for path in paths
             if path is not None
         }
-        return {name: known.get(path) or sha256_of(path) for name, path in found.items()}
+        return {name: known.get(path) or hash_of(path) for name, path in found.items()}
 
     input_hashes = hashes(inputs)
     space = judged_once(
