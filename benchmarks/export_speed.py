@@ -80,8 +80,10 @@ def main(options: Options) -> None:
         for what, product in PRODUCTS.items():
             print(f"{what} ...", flush=True)
             measured[what] = measure(run, product, options, folder / f"product-{len(measured)}")
-    question = f"Products of a run of {setting['views']} evaluation views of {setting['size']}, {setting['bands']} bands"
-    report = _common.Report("export_speed", question, setting, machine, judge(measured), measured)
+    of = f"{setting['views']} evaluation views of {setting['size']}, {setting['bands']} bands"
+    report = _common.Report(
+        "export_speed", f"Products of a run with {of}", setting, machine, judge(measured), measured
+    )
     _common.publish(report, _common.results_folder(options.results, options.quick))
 
 
