@@ -5,7 +5,7 @@ import pytest
 
 from tests.factories.commands import done, refused, run
 from tests.factories.outputs import read_video
-from unmix_plugin.commands.export import PRODUCTS, _write, export
+from unmix_plugin.commands.export import PRODUCTS, export, write_product
 from unmix_plugin.commands.render import render
 from unmix_plugin.engine.processes import Processes
 from unmix_plugin.errors import ConfigError
@@ -49,4 +49,4 @@ def test_no_process_at_all_and_several_for_what_is_made_as_a_whole_are_refused(t
     assert "num-devices" in refused(render, "--run", trained.run, "--num-devices", 0)
     mesh = next(product for product in PRODUCTS if product.name == "mesh")
     with pytest.raises(ConfigError, match="mesh runs in one process"):
-        _write(mesh, {}, Processes(1, 2))
+        write_product(mesh, {}, Processes(1, 2))

@@ -74,7 +74,7 @@ def wait_for_control(page, label):
 
 def test_what_was_measured_is_shown_where_the_scene_is_at_hand(trained):
     with served(trained.run) as (viewer, page):
-        viewer.services._reader.join(START_S)
+        viewer.services.wait_for_scene(START_S)
         assert isinstance(viewer.services.maker.aids.measured, MeasuredViews)
         page.set("layer", "error against a training view")
         page.wait_until(lambda: "mean absolute error of the bands against training view" in page.texts)

@@ -117,7 +117,7 @@ def test_a_run_is_looked_at_probed_edited_and_saved(viewer, browser):
     page = browser.page
     shown = browser.wait_for_picture(lambda picture: picture.std() > LEAST_SPREAD)
     browser.keep("first")
-    viewer.services._reader.join()
+    viewer.services.wait_for_scene()
 
     for name, layer in list(LAYERS.items())[1:]:
         browser.choose("layer", layer.title)

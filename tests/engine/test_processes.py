@@ -20,8 +20,8 @@ from unmix_plugin.engine.processes import (
     ALONE,
     Follower,
     Processes,
-    _run_processes,
     joined,
+    run_processes,
     start_together,
 )
 from unmix_plugin.engine.training.steps import prepare_steps
@@ -89,7 +89,7 @@ def run(tmp_path, capfd, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", str(ROOT))  # where these tests are
 
     def run_action(action):
-        code = _run_processes(MODULE, [str(tmp_path), action], 2)
+        code = run_processes(MODULE, [str(tmp_path), action], 2)
         kept = [torch.load(path) for path in sorted(tmp_path.glob("rank-*.pt"))]
         left = [path.read_text() for path in tmp_path.glob("threads-*.txt")]
         assert left

@@ -149,10 +149,11 @@ def finest(loop, screen):
 @contextmanager
 def running_loop(source, slow_speed=None):
     """A loop in a thread of its own."""
-    loop = make_loop(source, slow_speed)
+    loop, before = make_loop(source, slow_speed), set(threading.enumerate())
     loop.start()
     try:
         yield loop
     finally:
         loop.stop()
-    assert not loop._thread.is_alive()
+    left = {thread for thread in threading.enumerate() if thread.name == "unmix-viewer-render"}
+    assert left <= before

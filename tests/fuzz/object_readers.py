@@ -14,7 +14,7 @@ import trimesh
 from tests.factories import objects
 from tests.fuzz.mutation import Mutator, Reader, mutate_bytes, mutate_json
 from unmix_plugin.errors import SceneError
-from unmix_plugin.neumatex.fit.object_scene import _read_folder
+from unmix_plugin.neumatex.fit.object_scene import read_object_folder
 from unmix_plugin.neumatex.fit.pictures import read_picture
 from unmix_plugin.neumatex.tracing.light_files import read_environment
 from unmix_plugin.neumatex.tracing.mesh import read_mesh
@@ -72,7 +72,7 @@ def transforms_reader() -> Reader:
     """An object's own keys, with those of every scene."""
 
     def read(path: Path) -> None:
-        _read_folder(path.parent, [], needs_mesh=True)
+        read_object_folder(path.parent, [], needs_mesh=True)
 
     content, beside = json.loads(_object()["transforms.json"]), (("e.exr", b""), ("mesh.ply", b""))
     samples = tuple(json.dumps(content | more).encode() for more in ({}, {"environment_path": "e.exr"}))

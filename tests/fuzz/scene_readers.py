@@ -17,7 +17,7 @@ from unmix_plugin.captures.poses.turntable_observations import parse_angles
 from unmix_plugin.captures.wavelengths import parse_wavelengths
 from unmix_plugin.errors import ConfigError, SceneError, SpectrumError
 from unmix_plugin.formats.libraries import read_library
-from unmix_plugin.scenes.reading.cubes import UnreadableArrayError, _measure_cube, read_array_header
+from unmix_plugin.scenes.reading.cubes import UnreadableArrayError, measure_cube, read_array_header
 from unmix_plugin.scenes.reading.entries import locate_files, read_entries
 from unmix_plugin.scenes.reading.faults import Faults
 from unmix_plugin.scenes.reading.images import UnreadableImageError, read_colour, read_labels, read_mask
@@ -105,7 +105,7 @@ def _npy(array: np.ndarray) -> bytes:
 def _read_cube(path: Path) -> None:
     header = read_array_header(path)
     if len(header.shape) == 3 and 0 not in header.shape:
-        values = _measure_cube(path, SceneOptions())
+        values = measure_cube(path, SceneOptions())
         assert 0 <= values.num_invalid_pixels <= values.num_pixels
 
 

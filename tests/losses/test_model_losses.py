@@ -8,7 +8,7 @@ from tests.factories.models import NUM_BANDS, losses_of, make_model, make_rays
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.presets import WITHOUT_ALPHA
 from unmix_plugin.settings import LossConfig
-from unmix_plugin.spectral.evidence import _FAINT, relative_weights
+from unmix_plugin.spectral.evidence import relative_weights
 
 
 def test_a_last_colour_background_closes_every_ray_that_meets_something():
@@ -68,7 +68,7 @@ def test_relative_errors_count_the_more_the_darker_the_rendered_pixel_is(power):
         batch = {"spectra": 0.9 * spectra, "alpha": torch.ones(1)}
         return float(losses_of(model, batch, spectra, torch.ones(1))["spectral"])
 
-    faint = (0.2 + _FAINT) / (0.1 + _FAINT)
+    faint = (0.2 + 0.02) / (0.1 + 0.02)
     assert loss(0.2) == pytest.approx(0.02**2, rel=1e-4)
     assert loss(0.1) == pytest.approx(0.01**2 * faint**power, rel=1e-4)
     assert not relative_weights(torch.full((4, NUM_BANDS), 0.1, requires_grad=True), power).requires_grad

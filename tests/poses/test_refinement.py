@@ -20,7 +20,6 @@ from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.engine.processes import Processes
 from unmix_plugin.field import CoefficientField
 from unmix_plugin.model import UnmixModel
-from unmix_plugin.poses import refinement as pose_refinement
 from unmix_plugin.poses.knots import Knots, row_waves
 from unmix_plugin.poses.refinement import LARGEST_RATIO, LARGEST_STEP, PoseRefinement, RobustWeights
 from unmix_plugin.sensors.views import MeasuredPixels
@@ -134,8 +133,7 @@ def test_steps_are_a_share_of_a_pixel_and_bounds_a_share_of_the_picture():
     found = PoseRefinement((0,) * 4)
     directions = torch.eye(3)[[0, 1, 2, 0]]
     distances = torch.tensor([2.0, 4.0, 16.0, 16.0])
-    pixel = 4 * pose_refinement._COARSEST_PIXEL
-    found.begin(distances[:, None] * directions, box_around(torch.zeros(3), 1.0), pixel)
+    found.begin(distances[:, None] * directions, box_around(torch.zeros(3), 1.0), 0.0272)
     found.gauge.zero_()
     with torch.no_grad():
         found.steps.fill_(0.1)

@@ -27,7 +27,7 @@ from unmix_plugin.products.endmembers import write_endmembers
 from unmix_plugin.products.poses import export as export_poses
 from unmix_plugin.products.product import Job, Product
 from unmix_plugin.products.scene_products import Abundances, Cubes, Poses, Segmentation
-from unmix_plugin.products.spectrum import _facts, _ProbedPlace
+from unmix_plugin.products.spectrum import ProbedPlace, place_facts
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.trained.camera_files import read_camera_file
 from unmix_plugin.trained.places import MeasuredScene, SeenPixel
@@ -62,8 +62,8 @@ def test_the_material_of_a_pixel_is_that_of_its_label(method):
     camera = around()[0]
     ids = scene.look(camera)["segmentation"]
     for row, column in (ids < 255).nonzero()[::40].tolist():
-        place = _ProbedPlace("", "", {}, scene.probe(camera, column, row))
-        assert _facts(place, scene.materials)["material"] == MATERIALS.names[int(ids[row, column])]
+        place = ProbedPlace("", "", {}, scene.probe(camera, column, row))
+        assert place_facts(place, scene.materials)["material"] == MATERIALS.names[int(ids[row, column])]
 
 
 def test_labels_are_ids_whose_palette_and_legend_name_the_materials(tmp_path):

@@ -160,15 +160,16 @@ def num_evaluated(found: VisibleSamples) -> int:
 
 @pytest.mark.parametrize("smallest_weight", [0.0, 4e-3, 0.2])
 @pytest.mark.parametrize("opacity", [1e-4, 0.05, 0.9])
-@pytest.mark.parametrize("at_first", [rendering._FIRST_SAMPLES, rendering._FIRST_ON_GPU])
-def test_samples_found_from_the_front_are_those_of_all(monkeypatch, smallest_weight, opacity, at_first):
-    monkeypatch.setattr("unmix_plugin.rendering.renderer._FIRST_SAMPLES", at_first)
+@pytest.mark.parametrize("at_first", [None, 8, 32])
+def test_samples_found_from_the_front_are_those_of_all(smallest_weight, opacity, at_first):
     renderer, field = make(smallest_weight, depth=-math.log1p(-opacity))
     bundle, step = rays(30), renderer.step
     with torch.no_grad():
         field.table.normal_(std=3.0, generator=torch.Generator().manual_seed(2))
         samples = samples_of(renderer, bundle)
-        found = visible_samples(field, samples, bundle, step=step, smallest_weight=smallest_weight)
+        found = visible_samples(
+            field, samples, bundle, step=step, smallest_weight=smallest_weight, at_first=at_first
+        )
         encoded = field.encode(rendering.points_of(bundle, samples.ray_indices, samples.t)[0])
         densities, features = field.density_of(encoded)
         keep = volume_weights(densities * step, samples.packed_info) > smallest_weight

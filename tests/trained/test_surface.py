@@ -49,7 +49,8 @@ def test_rays_that_end_in_the_air_between_two_surfaces_give_no_points():
     model = ball_model.ball_scene(has_wall=True)
     cameras = [(-1.0, y, z) for y in (-0.6, 0.0, 0.6) for z in (-0.5, 0.5)]
     surface = seen(cameras, model, num_rays=20_000)
-    everything = torch.cat([part.positions for part in surface._points])
+    alone = [seen([camera], model, num_rays=20_000 // len(cameras)) for camera in cameras]
+    everything = torch.cat([one.points().positions for one in alone])
     points = surface.points().positions
 
     def off(positions):

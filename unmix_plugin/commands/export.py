@@ -76,10 +76,10 @@ def export(argv: list[str]) -> None:
     count = product.num_devices if isinstance(product, ViewProduct) else 1
     start_together("unmix_plugin.commands.export", argv, count)
     with joined(product.device) as processes:
-        _write(product, own, processes)
+        write_product(product, own, processes)
 
 
-def _write(product: RunWork, own: dict[str, _OwnProduct], processes: Processes) -> None:
+def write_product(product: RunWork, own: dict[str, _OwnProduct], processes: Processes) -> None:
     if not isinstance(product, ViewProduct) and processes.count > 1:
         raise ConfigError(f"unmix-export {product.name} runs in one process; start it once")
     with processes.together():

@@ -423,10 +423,10 @@ def start_together(module: str, argv: Sequence[str], count: int) -> None:
     """
     MachineConfig(count)  # which refuses too many
     if count > 1 and _started() is None:
-        sys.exit(_run_processes(module, argv, count))
+        sys.exit(run_processes(module, argv, count))
 
 
-def _run_processes(module: str, argv: Sequence[str], count: int) -> int:
+def run_processes(module: str, argv: Sequence[str], count: int) -> int:
     """Run a module in processes that find each other; the exit code of the first, which alone speaks."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))

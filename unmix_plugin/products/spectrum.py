@@ -77,7 +77,7 @@ def export(job: Job, asked: Spectrum) -> list[Path]:
     return written
 
 
-def _asked_place(job: Job, asked: Spectrum) -> _ProbedPlace:
+def _asked_place(job: Job, asked: Spectrum) -> ProbedPlace:
     """What is at the place asked for: exactly one of a pixel, a point and a region."""
     given = (
         asked.view is not None,
@@ -93,7 +93,7 @@ def _asked_place(job: Job, asked: Spectrum) -> _ProbedPlace:
         job.claim(_spectrum_paths(job.folder, name))
         found = _spectrum_at(job, Point(*point), _measured_scene(job, asked))
         title = f"point {', '.join(f'{value:g}' for value in point)}"
-        return _ProbedPlace(name, title, {"point": list(point)}, found.probe, over_views=found.measured)
+        return ProbedPlace(name, title, {"point": list(point)}, found.probe, over_views=found.measured)
     if given != (True, True, False, False):
         raise ConfigError(
             "give a pixel with --view and --pixel, a point with --point, or a region with --region alone"
@@ -109,7 +109,7 @@ def _asked_place(job: Job, asked: Spectrum) -> _ProbedPlace:
     found = _spectrum_at(job, Pixel(view.camera, column, row), measured)
     title, facts = f"{view.name}, column {column}, row {row}", {"view": view.name, "pixel": [column, row]}
     own = _of_pixel(job, measured, view, column, row)
-    return _ProbedPlace(name, title, facts, found.probe, own, over_views=found.measured)
+    return ProbedPlace(name, title, facts, found.probe, own, over_views=found.measured)
 
 
 def _measured_scene(job: Job, asked: Spectrum) -> MeasuredScene | None:
@@ -125,14 +125,14 @@ def _spectrum_at(job: Job, place: Pixel | Point, measured: MeasuredScene | None)
     return found
 
 
-def _region(job: Job, region: str) -> _ProbedPlace:
+def _region(job: Job, region: str) -> ProbedPlace:
     name, kept = safe_name(f"region_{region}", NOT_PORTABLE), job.loaded.measures.region(region)
     job.claim([*_spectrum_paths(job.folder, name), *envi_library_paths(job.folder / name)])
     found = spectrum_at(job.scene, NamedRegion(region, kept, measured_surface(job)))
     assert found.region is not None
     job.say(f"{region}: {found.region.in_words(job.materials.names, job.scene.scale)}")
     facts = {"region": region, "area_square_units": found.region.area}
-    return _ProbedPlace(name, f"region {region}", facts, found.probe, spread=found.region.spread)
+    return ProbedPlace(name, f"region {region}", facts, found.probe, spread=found.region.spread)
 
 
 def _of_pixel(
@@ -157,7 +157,7 @@ def _of_pixel(
 
 
 @dataclass(frozen=True)
-class _ProbedPlace:
+class ProbedPlace:
     """A place, and all that is known of it."""
 
     name: str
@@ -183,7 +183,7 @@ def _spectrum_paths(folder: Path, name: str) -> list[Path]:
     return [folder / f"{name}.{kind}" for kind in ("csv", "json", "png")]
 
 
-def _write_spectrum(folder: Path, place: _ProbedPlace, scene: TrainedScene) -> list[Path]:
+def _write_spectrum(folder: Path, place: ProbedPlace, scene: TrainedScene) -> list[Path]:
     """Write NAME.csv (`wavelength,predicted,...`, `measured` and mean and standard deviation over views where they are
     known), NAME.json (where the place is, its opacity, abundances and nearest known materials) and NAME.png, a plot.
     """
@@ -204,12 +204,12 @@ def _write_spectrum(folder: Path, place: _ProbedPlace, scene: TrainedScene) -> l
         columns |= {f"{name}_low": interval.low, f"{name}_high": interval.high}
     values = np.stack(list(columns.values()))
     write_spectra_csv(table_path, SpectraTable(materials.bands, tuple(columns), values))
-    facts = {**_facts(place, materials), "scale": describe_scale(scene.scale)}
+    facts = {**place_facts(place, materials), "scale": describe_scale(scene.scale)}
     write_file(facts_path, (json.dumps(facts, indent=1, allow_nan=False) + "\n").encode())
     return [table_path, facts_path, write_file(plot_path, _draw_spectrum(place, materials))]
 
 
-def _draw_spectrum(place: _ProbedPlace, materials: Materials) -> bytes:
+def _draw_spectrum(place: ProbedPlace, materials: Materials) -> bytes:
     """The spectra over wavelength, and the abundances beside them."""
     from matplotlib.figure import Figure
 
@@ -278,7 +278,7 @@ def _draw_abundances(axes: Any, probe: Probe, materials: Materials) -> None:
     axes.set_title(f"opacity {probe.opacity:.2f}", loc="left")
 
 
-def _facts(place: _ProbedPlace, materials: Materials) -> dict[str, Any]:
+def place_facts(place: ProbedPlace, materials: Materials) -> dict[str, Any]:
     probe = place.probe
     is_something = probe.opacity >= OCCUPIED_ACCUMULATION
     shares = dict(zip(materials.names, probe.abundances.tolist(), strict=True))

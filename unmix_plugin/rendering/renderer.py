@@ -65,18 +65,19 @@ def visible_samples(
     *,
     step: float,
     smallest_weight: float,
+    at_first: int | None = None,
 ) -> VisibleSamples:
     """Of samples of the rays that lie `step` apart those that contribute more than `smallest_weight` of their ray's
     light.
 
-    The first samples of all rays are evaluated first, then twice as many of the rays that still let light through, and
-    so on: what lies behind can't contribute enough, whatever it is.
+    The first samples of all rays are evaluated first, so many as `at_first` says, or as suit the device, then twice as
+    many of the rays that still let light through, and so on: what lies behind can't contribute enough, whatever it is.
     """
     starts, counts = samples.packed_info.unbind(-1)
     depths, rows = torch.zeros_like(samples.t), torch.zeros_like(samples.ray_indices)
     evaluated: list[EvaluatedSamples] = []
     first, num_evaluated, transmittance = 0, 0, torch.ones_like(counts, dtype=samples.t.dtype)
-    at_first = _FIRST_SAMPLES if depths.device.type == "cpu" else _FIRST_ON_GPU
+    at_first = at_first or (_FIRST_SAMPLES if depths.device.type == "cpu" else _FIRST_ON_GPU)
     while True:
         wanted = (counts - first).clamp(0, max(first, at_first)) * (transmittance > smallest_weight)
         rays, chosen, _ = packed_rows(starts + first, wanted)

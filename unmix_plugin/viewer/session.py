@@ -128,9 +128,13 @@ class Services:
         self.videos.stop()
         self.regions.stop()
         self.loop.stop()
+        # Not left behind: a thread in native code when the interpreter ends takes the process down with it.
+        self.wait_for_scene()
+
+    def wait_for_scene(self, timeout_s: float | None = None) -> None:
+        """Wait until the scene is read, if it is being read."""
         if self._reader.is_alive():
-            # Not left behind: a thread in native code when the interpreter ends takes the process down with it.
-            self._reader.join()
+            self._reader.join(timeout_s)
 
     def _read(self) -> None:
         """Read the scene; without it the viewer only lacks what was measured."""

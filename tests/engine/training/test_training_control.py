@@ -54,8 +54,6 @@ def contest(monkeypatch):
 
         viewer = in_background(be_viewer)
         for _ in range(steps):
-            while device._waiting["viewer"] == 0:  # the viewer is on its way to its next turn
-                time.sleep(0)
             step(device.training_turn(), "training")
         is_over.set()
         device.is_training = False

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unmix_plugin.spectral.colour.names import _TYPICAL, colour_words, numbered_words
+from unmix_plugin.spectral.colour.names import TYPICAL_COLOURS, colour_words, numbered_words
 
 
 @pytest.mark.parametrize(
@@ -45,7 +45,7 @@ def test_colours_are_called_what_people_call_them(srgb, word):
 
 
 def test_typical_colours_have_their_own_word():
-    for word, colours in _TYPICAL.items():
+    for word, colours in TYPICAL_COLOURS.items():
         srgb = np.array([list(bytes.fromhex(colour)) for colour in colours.split()]) / 255
         assert colour_words(srgb) == [word] * len(srgb)
 

@@ -145,7 +145,7 @@ class PosedObject:
 def load_posed_object(root: Path, mesh: Path | None = None) -> PosedObject:
     """Read and check an object's folder, which need not have a light; a mesh that is given takes the place of its own.
     Errors are those of `load_object`."""
-    folder = _read_folder(root, [], needs_mesh=True, mesh=mesh, environment=root)
+    folder = read_object_folder(root, [], needs_mesh=True, mesh=mesh, environment=root)
     frame, placed, pictures = _placed(folder, [])
     bands = _bands_of(folder, pictures, None)
     return PosedObject(root, placed, frame, pictures, folder.split, bands, folder.lamp(bands))
@@ -163,7 +163,7 @@ def load_object(
         SceneError: the folder is not a sound object; the message says what is wrong with it.
     """
     root, notes = root.resolve(), list[str]()
-    folder = _read_folder(root, notes, needs_mesh=True, mesh=mesh, environment=environment)
+    folder = read_object_folder(root, notes, needs_mesh=True, mesh=mesh, environment=environment)
     frame, placed_mesh, pictures = _placed(folder, notes)
     bands = _bands_of(folder, pictures, None)
     if bands is None and lamp is not None:
@@ -266,7 +266,7 @@ class _Folder:
         return read_lamp(str(path), bands)
 
 
-def _read_folder(
+def read_object_folder(
     root: Path,
     notes: list[str],
     needs_mesh: bool,
@@ -423,7 +423,7 @@ def _read_held_out(
 ) -> HeldOutLight:
     """A folder below relit/, given the object's pictures, bands and lamp."""
     remarks = list[str]()
-    folder = _read_folder(root, remarks, needs_mesh=False)
+    folder = read_object_folder(root, remarks, needs_mesh=False)
     notes += [f"relit/{root.name}/{warning}" for warning in remarks]
     pictures = folder.pictures(frame)
     if pictures.tone == "camera" != own.tone:

@@ -161,7 +161,7 @@ class _CubeValues:
         return 0 if self.invalid is None else int(self.invalid.sum())
 
 
-def _measure_cube(path: Path, options: SceneOptions, where: str = "") -> _CubeValues:
+def measure_cube(path: Path, options: SceneOptions, where: str = "") -> _CubeValues:
     """What a checked (H, W, B) cube holds; whatever `read_cube` would make of it."""
     cube, value_scale = map_array(path), options.value_scale
     scale = np.float32(1.0 if value_scale is None else value_scale)
@@ -291,7 +291,7 @@ def _check_values(
     """Read and check every value of the cubes that have a path."""
 
     def measure(frame: FrameEntry, path: Path | None) -> _CubeValues | None:
-        return None if path is None else _measure_cube(path, options, frame.name_of(CUBE_KEY))
+        return None if path is None else measure_cube(path, options, frame.name_of(CUBE_KEY))
 
     with ThreadPoolExecutor(min(_MOST_READERS, os.cpu_count() or 1)) as readers:
         measured = list(readers.map(measure, frames, paths))

@@ -18,7 +18,7 @@ from jaxtyping import Float, Float64
 
 from unmix_plugin.spectral.colour.difference import ciede2000, srgb_to_lab
 
-_TYPICAL = {
+TYPICAL_COLOURS = {
     "black": "000000 1b1b1b",
     "white": "ffffff ebebeb",
     "grey": "363636 5a5a5a 808080 a6a6a6 c8c8c8",
@@ -52,7 +52,7 @@ _TYPICAL = {
 @lru_cache
 def _typical() -> tuple[tuple[str, ...], Float64[np.ndarray, "N 3"]]:
     """The word of each typical colour, and its L*a*b*."""
-    pairs = [(word, colour) for word, colours in _TYPICAL.items() for colour in colours.split()]
+    pairs = [(word, colour) for word, colours in TYPICAL_COLOURS.items() for colour in colours.split()]
     srgb = np.array([list(bytes.fromhex(colour)) for _, colour in pairs]) / 255
     return tuple(word for word, _ in pairs), srgb_to_lab(srgb)
 
