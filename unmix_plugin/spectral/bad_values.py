@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from unmix_plugin.spectral.evidence import brightness
-from unmix_plugin.spectral.noise import estimate_noise
+from unmix_plugin.spectral.subspace import estimate_noise
 
 FEWEST_BANDS, _PIXELS_PER_BAND = 8, 10
 """Least number of bands, and of pixels for each, from which noise can be estimated."""

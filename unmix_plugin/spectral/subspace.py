@@ -4,7 +4,11 @@ Bands are weighted so that noise is alike in all of them; then the leading eigen
 moments are an orthonormal basis of which no other of its size misses less. There is no mean spectrum: black stays
 black, and a pixel half as bright has half the numbers.
 
+Noise is what of each band the others can't tell (Bioucas-Dias and Nascimento 2008).
+
 Notation: `N` spectra, `B` bands, `P` components, `*rays` any leading axes.
+
+Source: J. M. Bioucas-Dias and J. M. P. Nascimento, "Hyperspectral Subspace Identification", IEEE TGRS 46(8), 2008.
 """
 
 from __future__ import annotations
@@ -17,7 +21,6 @@ from torch import Tensor
 
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.evidence import brightness
-from unmix_plugin.spectral.noise import estimate_noise
 
 _FEWEST_SPECTRA = 4
 """That three components need."""
@@ -27,6 +30,19 @@ _LEAST_NOISE = 0.005
 """Noise that is assumed at least, as a share of the median brightness: what any model misses is more."""
 _SHARE, _SIGMAS_OF_SHARE = 0.95, 1.96
 """Of normal errors, so many are within so many standard deviations; spikes are among the others."""
+
+
+def estimate_noise(pixels: Float[Tensor, "N B"]) -> Float[Tensor, "N B"]:
+    """What of each band the other bands can't predict linearly (Bioucas-Dias and Nascimento 2008, algorithm 1)."""
+    data = pixels.double()
+    num_bands = data.shape[1]
+    correlation = data.T @ data
+    # A trace on the diagonal keeps bands that depend on each other exactly from being inverted into infinities.
+    trace = 1e-12 * correlation.diagonal().mean().clamp(min=1e-300)
+    inverse = torch.linalg.inv(correlation + trace * torch.eye(num_bands).to(data))
+    # By the block inverse, row b of the inverse divided by its diagonal holds 1 and minus the coefficients of band b.
+    residual = data @ (inverse / inverse.diagonal()[:, None]).T
+    return residual.to(pixels.dtype)
 
 
 @dataclass(frozen=True)

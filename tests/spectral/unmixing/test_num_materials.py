@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from tests.factories.mixtures import mixed_pixels, seeded, smooth_endmembers, surface_pixels
 from unmix_plugin.errors import SpectrumError
-from unmix_plugin.spectral.noise import estimate_noise
+from unmix_plugin.spectral.subspace import estimate_noise
 from unmix_plugin.spectral.unmixing.num_materials import elbow, hysime, propose_num_materials
 
 

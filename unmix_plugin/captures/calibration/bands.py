@@ -204,7 +204,7 @@ def noise_shares(values: Float32[np.ndarray, "N B"]) -> Float64[np.ndarray, " B"
     few pixels."""
     import torch
 
-    from unmix_plugin.spectral.noise import estimate_noise
+    from unmix_plugin.spectral.subspace import estimate_noise
 
     count, bands = values.shape
     if count < 4 * bands or bands < 8:

@@ -25,7 +25,7 @@ from torch import Tensor
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import RayBundle, SceneBox, UnitSpace
 from unmix_plugin.scenes.geometry.filters import without_specks
-from unmix_plugin.scenes.geometry.footprints import LineView, PixelView, view_of_cells
+from unmix_plugin.scenes.geometry.footprints import LineView, PixelView
 from unmix_plugin.scenes.geometry.views import look_up
 from unmix_plugin.scenes.scene import Scene
 
@@ -148,7 +148,9 @@ def carve_box(
         witnesses: Views that must look through a cell for it to go.
     """
     views = [
-        view_of_cells(cameras, index, None if foreground is None else foreground[index])
+        (LineView if cameras.is_line_camera(index) else PixelView)(
+            cameras, index, None if foreground is None else foreground[index]
+        )
         for index in range(len(cameras))
     ]
     sizes = [resolution]

@@ -39,13 +39,6 @@ class Judged:
     """So it tells of each part, too: none is seen, or all of them are and none is looked through. None if unknown."""
 
 
-def view_of_cells(
-    cameras: Cameras, index: int, foreground: Bool[np.ndarray, "H W"] | None
-) -> PixelView | LineView:
-    """One view, of a camera that takes pictures or lines; `foreground` is True on pixels that may show something."""
-    return (LineView if cameras.is_line_camera(index) else PixelView)(cameras, index, foreground)
-
-
 class _Covered:
     """Running sums of foreground pixels, so that any rectangle of a view is counted with four look-ups."""
 

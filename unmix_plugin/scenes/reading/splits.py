@@ -89,23 +89,21 @@ def split_by_lists(
     owners: dict[str, set[int]] = {}  # several frames may share a picture, such as those of a rig's cubes
     for index, paths in enumerate(names):
         for path in paths:
-            owners.setdefault(_plain(path), set()).add(index)
+            owners.setdefault(str(PurePosixPath(path)), set()).add(index)
     chosen: dict[str, set[int]] = {}
     for name, paths in lists.items():
+        chosen[name] = set()
         for path in paths:
-            if _plain(path) not in owners:
+            named = owners.get(str(PurePosixPath(path)), set())
+            if not named:
                 faults.note(f"'{name}_filenames'", Message.NOT_A_FRAME, path=path)
-        chosen[name] = {index for path in paths for index in owners.get(_plain(path), ())}
+            chosen[name] |= named
     everything = set(range(len(names)))
     train = chosen.get("train", everything - chosen.get("val", set()) - chosen.get("test", set()))
     evaluation = chosen.get("test") or chosen.get("val")
     if evaluation is None:
         evaluation = everything - chosen["train"] if "train" in chosen else set()
     return train, evaluation
-
-
-def _plain(path: str) -> str:
-    return str(PurePosixPath(path))
 
 
 def _name_split(paths: dict[str, str]) -> str | None:

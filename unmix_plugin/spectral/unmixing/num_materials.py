@@ -19,7 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from unmix_plugin.errors import SpectrumError
-from unmix_plugin.spectral.noise import estimate_noise
+from unmix_plugin.spectral.subspace import estimate_noise
 from unmix_plugin.spectral.unmixing.two_material_mixtures import two_material_fits
 
 LEAST_BANDS = 8
