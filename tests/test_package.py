@@ -152,7 +152,7 @@ def test_help_of_every_command_is_printed_without_a_heavy_package():
 
 def in_a_new_process(code, **environment):
     """What Python code prints, started without what these tests set."""
-    kept = {name: value for name, value in os.environ.items() if not name.startswith("OMP_")}
+    kept = {name: value for name, value in os.environ.items() if not name.startswith(("OMP_", "OPENBLAS_"))}
     command = [sys.executable, "-W", "always", "-c", code]
     return subprocess.run(command, capture_output=True, text=True, check=True, env={**kept, **environment})
 
@@ -164,6 +164,16 @@ def test_torch_loads_with_threads_that_sleep_while_they_wait_from_python_too():
     assert found.stdout.split() == ["False", "PASSIVE", "True"]
     assert "OMP_WAIT_POLICY" not in found.stderr
     assert in_a_new_process(code, OMP_WAIT_POLICY="ACTIVE").stdout.split() == ["False", "ACTIVE"]
+
+
+def test_commands_load_numpy_with_one_thread_for_its_products_unless_told_otherwise():
+    shown = "print('numpy' in sys.modules, os.environ['OPENBLAS_NUM_THREADS'])"
+    code = f"import os, sys, unmix_plugin.commands.scripts; {shown}"
+    assert in_a_new_process(code).stdout.split() == ["False", "1"]
+    assert in_a_new_process(code, OPENBLAS_NUM_THREADS="4").stdout.split() == ["False", "4"]
+    assert (
+        "OPENBLAS_NUM_THREADS" not in in_a_new_process("import os, unmix_plugin; print(*os.environ)").stdout
+    )
 
 
 def test_who_imports_torch_first_is_told_what_that_costs():

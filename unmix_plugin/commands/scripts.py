@@ -1,7 +1,11 @@
 """The console scripts. They import their commands, which takes seconds, where signals are already looked after."""
 
+import os
 import signal
 
+# Threads of numpy's OpenBLAS spin while they wait, as OpenMP's do: beside anything else on the machine a demo capture
+# took three times as long, and alone they gain nothing, since large products are torch's. Read once, as numpy loads.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # Until then Ctrl-C ends the process at once, as other signals do: there is nothing to clean up.
 if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
