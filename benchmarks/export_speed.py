@@ -109,7 +109,7 @@ def describe(run: Path, options: Options) -> dict[str, Any]:
         "views": len(cameras["camera_to_world"]),
         "size": f"{cameras['width']} x {cameras['height']} pixels",
         "bands": len(metadata["wavelengths_nm"]),
-        "rays a pixel": metadata["subpixels"] ** 2,
+        "rays per pixel": metadata["subpixels"] ** 2,
         "device": options.device,
     }
 

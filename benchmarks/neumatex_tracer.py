@@ -4,7 +4,7 @@
     OMP_NUM_THREADS=1 python benchmarks/neumatex_tracer.py
 
 Renders three procedural objects (Lambert, rough conductor, a blend of both) under one asymmetric environment with both
-programs, direct light alone and with one bounce, with the same number of paths a pixel. Mitsuba runs its variant
+programs, direct light alone and with one bounce, with the same number of paths per pixel. Mitsuba runs its variant
 `scalar_rgb`. Both use one thread; speeds are by processor time, since the machine may be busy. What is compared are
 means over blocks of pixels, which have little noise; pixels that the object covers only in part are left out, since
 the programs place rays in them differently. Takes some minutes.
@@ -155,7 +155,7 @@ def report(measured: list[dict[str, Any]], options: Options, machine: dict[str, 
         "Does the path tracer agree with Mitsuba, and how fast is it beside it?",
         {
             "size": options.size,
-            "paths a pixel": options.paths,
+            "paths per pixel": options.paths,
             "environment": "window-room",
             "threads": 1,
             "paths a second": "of pixels that show the object; Mitsuba also spends one ray a path on other pixels",

@@ -4,7 +4,7 @@
 
 Trains on the built-in scene (or `--scene DIR`) in one process and in two that share the cores, with as many steps and
 rays, by the commands that a user would give, and evaluates both. Then short trainings in one process on one core with
-fewer samples a step tell which part of a step the rays share out; from it, and from the bytes that are exchanged,
+fewer samples per step tell which part of a step the rays share out; from it, and from the bytes that are exchanged,
 follows what 1, 2, 4 and 8 devices of this core's speed would reach. Takes about five minutes.
 """
 
@@ -30,7 +30,7 @@ from unmix_plugin.model import SAMPLES_ON_CPU
 PSNR_DIFFERENCE = _common.Limit(0.2, is_upper=True, unit=" dB")
 MIOU_DIFFERENCE = _common.Limit(0.02, is_upper=True)
 SHARES = (1.0, 0.5, 0.25, 0.125)
-"""Of the usual samples a step."""
+"""Of the usual samples per step."""
 DEVICES = (1, 2, 4, 8)
 NETWORKS = {"10 Gbit/s Ethernet": 1.25e9, "100 Gbit/s": 12.5e9}
 """Bytes a second."""

@@ -1,6 +1,6 @@
 """Training batches of rays with their spectra, from a validated scene.
 
-Notation: `R` pixels of a batch, `P` rays a pixel, `B` bands, `H x W` pixels of a view. A pixel measures the mean over
+Notation: `R` pixels of a batch, `P` rays per pixel, `B` bands, `H x W` pixels of a view. A pixel measures the mean over
 its area, so several rays are cast through it, one in each cell of a grid on it; they follow each other in a bundle.
 """
 

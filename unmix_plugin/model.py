@@ -279,7 +279,7 @@ class UnmixModel(Model):
 
     def get_train_loss_dict(self, ray_bundle: RayBundle, batch: dict[str, Tensor]) -> TrainOutputs:
         """`batch` and `num_samples`; weighted losses by name, those of no weight left out; and `psnr` of the batch in
-        dB, on black, samples a ray evaluated and visible, the share of the grid's cells that are occupied, how far
+        dB, on black, samples per ray evaluated and visible, the share of the grid's cells that are occupied, how far
         poses were corrected, and in an unbounded world the part of light that does not come from the sky."""
         num_rays = max(len(ray_bundle), 1)
         measured = from_batch(batch, len(ray_bundle), self.seen_by.num_channels)

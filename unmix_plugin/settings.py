@@ -44,7 +44,7 @@ COARSEST_REFINED = 4
 """Cells along the scene box on the coarsest level at most where poses are refined: a pose that is off by a cell still
 finds its way."""
 _LARGE_BOX = 300
-"""Pixels along the scene box from which on fewer samples a pixel do."""
+"""Pixels along the scene box from which on fewer samples per pixel do."""
 _USUAL_ENDMEMBERS = 6
 _PIXELS_TO_COUNT_BY = 20_000
 _WHY_LIGHT = {

@@ -130,7 +130,7 @@ def test_a_bad_capture_is_refused(tmp_path: Path, spoil: Spoil, options: dict[st
     [
         ("cubes", "nowhere", "nowhere is not there; give the folder of the capture with --data"),
         ("cube", ".", "did you mean cubes?"),
-        ("cubes", ".", "holds no cubes; expected one file a view"),
+        ("cubes", ".", "holds no cubes; expected one file per view"),
     ],
 )
 def test_the_command_ends_with_the_users_error(tmp_path: Path, layout: str, folder: str, message: str):

@@ -154,7 +154,7 @@ def test_ctrl_c_reaches_all_processes_and_what_was_learned_is_saved(run, tmp_pat
 def test_more_processes_than_rays_are_refused(tmp_path):
     _, steps = prepare_steps(config_for(tmp_path))
     steps.processes = Processes(0, 4)
-    with pytest.raises(ConfigError, match="4 processes for 3 rays a step; use fewer processes"):
+    with pytest.raises(ConfigError, match="4 processes for 3 rays per step; use fewer processes"):
         steps.share_rays(3)
 
 

@@ -94,7 +94,7 @@ def cameras_of(
 
 
 def ball_alpha(pose: np.ndarray, radius: float, width: int, height: int, focal: float) -> np.ndarray:
-    """Coverage (H, W) of a ball at the origin, from 5 x 5 rays a pixel."""
+    """Coverage (H, W) of a ball at the origin, from 5 x 5 rays per pixel."""
     steps = (np.arange(5) + 0.5) / 5.0
     x = (np.arange(width)[:, None] + steps).reshape(-1)
     y = (np.arange(height)[:, None] + steps).reshape(-1)

@@ -33,7 +33,7 @@ from unmix_plugin.scenes.demo.scene import make_demo_scene
 pytestmark = pytest.mark.slow
 HAS_CUDA = torch.cuda.is_available()
 STEPS = 33
-"""Enough for updates of the occupancy grid, more rays a pixel, and the specular part."""
+"""Enough for updates of the occupancy grid, more rays per pixel, and the specular part."""
 SMALL = {
     "mesh": ["--resolution", 12],
     "page": ["--resolution", 12],

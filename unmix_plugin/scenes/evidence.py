@@ -46,7 +46,7 @@ class AlphaEvidence:
         """Of each sensor the brightness of its background, as `alpha_confidence` takes it."""
         for block in self._blocks if has_alpha else ():
             stride = max(1, int(block.valid.sum()) // _PIXELS_OF_BACKGROUND)
-            is_whole = bool(block.valid.all())  # then a list of all of them would take eight bytes a pixel
+            is_whole = bool(block.valid.all())  # then a list of all of them would take eight bytes per pixel
             pixels = torch.arange(0, len(block), stride) if is_whole else block.valid.nonzero()[::stride, 0]
             chosen = pixels.to(block.alpha.device)
             self.levels[block.sensor] = background_level(block.spectra(chosen), block.alpha[chosen])

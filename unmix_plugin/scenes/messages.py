@@ -207,7 +207,7 @@ class Message(Enum):
     ABUNDANCE_SIZE = (
         "has {width} x {height} pixels (width x height); expected {wide} x {high} as the cubes have"
     )
-    ABUNDANCE_COUNT = "has {found} abundances a pixel; expected {expected}, one a material"
+    ABUNDANCE_COUNT = "has {found} abundances per pixel; expected {expected}, one per material"
     ABUNDANCE_RANGE = "has abundances outside [0, 1] or NaN; expected fractions"
 
     # Splits

@@ -1,7 +1,7 @@
 """What is composited along rays, the spectra that it is multiplied with, and every picture that follows from both.
 
 A ray's diffuse spectrum is linear in the endmembers, sum_i w_i E^T S_i a_i = E^T sum_i w_i S_i a_i. So a renderer
-composites 2 + 2 K + J numbers a ray, one packed tensor, and the B bands are made once a ray.
+composites 2 + 2 K + J numbers per ray, one packed tensor, and the B bands are made once a ray.
 
 Notation: `B` bands, `K` endmembers, `J` spectra of the specular dictionary, `C` columns of a matrix on spectra, `*rays`
 any leading axes.

@@ -44,7 +44,7 @@ def render_aligned(
     scene: TrainedScene, camera: Cameras, measured: Scene, index: int, truth: ViewTruth
 ) -> PredictedView:
     """A view as it is compared with what was measured of it: aligned as far as the scene's `fitted` says, with a rig
-    in as many rays a pixel as its sensor asks for; `truth` was measured in the frame at `index`."""
+    in as many rays per pixel as its sensor asks for; `truth` was measured in the frame at `index`."""
     if "pose" in scene.fitted:
         align = align_rows if camera.is_line_camera(0) else align_pose
         camera = align(scene, camera, truth)

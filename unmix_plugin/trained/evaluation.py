@@ -82,7 +82,7 @@ class PredictedView:
 
 
 def render_view(scene: TrainedScene, camera: Cameras, subpixels: int | None = None) -> PredictedView:
-    """Render all that is written about a view; `subpixels` squared rays a pixel, None for as many as in training."""
+    """Render all that is written about a view; `subpixels` squared rays per pixel, None for as many as in training."""
     return predicted_view(scene.look(camera, subpixels))
 
 

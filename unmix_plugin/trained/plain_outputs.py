@@ -34,7 +34,7 @@ _Compute: TypeAlias = Callable[[MixtureView], Tensor]
 def light_through(
     matrix: Callable[[Bands], Tensor], *, diffuse: bool = True, specular: bool = True
 ) -> _Compute:
-    """Linear light through three weights a band, not cut at white: in another light a band may exceed full scale."""
+    """Linear light through three weights per band, not cut at white: in another light a band may exceed full scale."""
     return lambda view: view.materials.through(
         view.coefficients, matrix(view.materials.bands), diffuse=diffuse, specular=specular
     )

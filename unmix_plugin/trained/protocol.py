@@ -175,7 +175,7 @@ class RenderableScene(Protocol):
         ...
 
     def look(self, camera: Cameras, subpixels: int | None = None) -> RenderedView:
-        """Render a view; `subpixels` squared rays a pixel, None for as many as in training."""
+        """Render a view; `subpixels` squared rays per pixel, None for as many as in training."""
         ...
 
     def render(self, camera: Cameras, names: Collection[str]) -> dict[str, Tensor]:

@@ -281,7 +281,7 @@ class TrainedScene:
         return found
 
     def look(self, camera: Cameras, subpixels: int | None = None) -> MaterialView:
-        """Render a view; `subpixels` squared rays a pixel, None for as many as in training, but two at most where
+        """Render a view; `subpixels` squared rays per pixel, None for as many as in training, but two at most where
         pixels are half as wide as the finest that were measured, or less: rays are as close as there."""
         places = evenly_in_pixel(self.subpixels if subpixels is None else subpixels)
         if subpixels is None and len(places) > len(DIAGONAL):

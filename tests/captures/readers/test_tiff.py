@@ -334,7 +334,11 @@ MOSAIC = {"photometric": "cfa", "extratags": [(33421, "H", 2, (2, 2)), (33422, "
         (BYTES, PALETTE, "places in a table of colours"),
         (BYTES, MOSAIC, "CFA"),
         (COLOURS, {"photometric": "cielab"}, "colour space of the eye"),
-        (np.stack([COLOURS] * 2), {"photometric": "rgb"}, "2 pages of 3 numbers a pixel; expected one page"),
+        (
+            np.stack([COLOURS] * 2),
+            {"photometric": "rgb"},
+            "2 pages of 3 numbers per pixel; expected one page",
+        ),
         (CUBE.astype(np.complex64), {}, "the image holds complex64; expected real numbers"),
     ],
 )

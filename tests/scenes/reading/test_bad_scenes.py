@@ -179,7 +179,11 @@ MASK, NO_PICTURE = "mask.png", "cannot be read as a picture: PNG, JPEG, TIFF"
         (LABELS, np.zeros((HEIGHT, WIDTH, 3), np.uint8), "is a picture of mode RGB; expected one 8-bit"),
         (LABELS, np.zeros((HEIGHT, WIDTH), np.uint16), "expected one 8-bit channel"),
         (LABELS, np.full((HEIGHT, WIDTH), 2, np.uint8), "has label 2; expected 0 to 1 for the materials, or"),
-        (ABUNDANCES, np.zeros((HEIGHT, WIDTH, 3)), "has 3 abundances a pixel; expected 2, one a material"),
+        (
+            ABUNDANCES,
+            np.zeros((HEIGHT, WIDTH, 3)),
+            "has 3 abundances per pixel; expected 2, one per material",
+        ),
         (ABUNDANCES, np.zeros((HEIGHT + 1, WIDTH, 2)), "has 20 x 17 pixels"),
         (ABUNDANCES, np.full((HEIGHT, WIDTH, 2), np.nan), "has abundances outside [0, 1] or NaN"),
         (ABUNDANCES, np.full((HEIGHT, WIDTH, 2), 7), "has abundances outside [0, 1] or NaN"),

@@ -1,5 +1,5 @@
-"""Layout `cubes`: a folder with one spectral file a view, one folder of band files a view, or a tree of such folders as
-instruments write them.
+"""Layout `cubes`: a folder with one spectral file per view, one folder of band files per view, or a tree of such folders
+as instruments write them.
 
 Files with the name of a cube and a suffix of a picture are its RGB picture. Where there are pictures alone, they are
 the views: three bands, gamma-encoded.
@@ -105,7 +105,7 @@ def find_cubes(root: Path, options: ReadOptions) -> Capture:
     if not shown:
         kinds = ", ".join(sorted(_CUBE_SUFFIXES | _PICTURE_SUFFIXES))
         raise CaptureError(
-            f"{root} holds no cubes; expected one file a view ({kinds}), or one folder of band files a view"
+            f"{root} holds no cubes; expected one file per view ({kinds}), or one folder of band files per view"
         )
     views, unreadable = _open_views(
         _names(shown), shown, [{}] * len(shown), files if folders else [], options
@@ -177,7 +177,7 @@ def _capture_of_groups(root: Path, folders: dict[Path, list[Path]], options: Rea
     complete = {key: group for key, group in groups.items() if "cube" in group or "result" in group}
     if not complete:
         raise CaptureError(
-            f"{root} holds references only ({name_some([path.name for path in left_out])}); expected one file a view"
+            f"{root} holds references only ({name_some([path.name for path in left_out])}); expected one file per view"
         )
     take_results = all("result" in group for group in complete.values()) and not all(
         "cube" in group and "white" in group for group in complete.values()

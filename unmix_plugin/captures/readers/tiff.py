@@ -274,7 +274,7 @@ def _find_stack(path: Path, file: TiffFile, remarks: list[Remark]) -> _Stack:
         return _Stack(like, (height, width, planes * samples), dtype)
     if planes * samples > 1:
         raise CaptureError(
-            f"{path}: {len(like)} pages of {planes * samples} numbers a pixel; expected one page with all bands, or "
+            f"{path}: {len(like)} pages of {planes * samples} numbers per pixel; expected one page with all bands, or "
             "one band a page"
         )
     return _Stack(like, (len(like), height, width), dtype)

@@ -107,7 +107,7 @@ class TrainingSteps:
         own = num_rays // self.processes.count
         if own == 0:
             raise ConfigError(
-                f"{self.processes.count} processes for {num_rays} rays a step; use fewer processes"
+                f"{self.processes.count} processes for {num_rays} rays per step; use fewer processes"
             )
         self.pipeline.datamanager.set_train_rays_per_batch(own)
 

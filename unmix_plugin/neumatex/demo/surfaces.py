@@ -67,7 +67,7 @@ def blob(rng: np.random.Generator) -> Field:
 
 
 def meshed(field: Field, resolution: int) -> Mesh:
-    """The zero level by marching cubes with R samples an edge, with normals by the field's gradient; in model space."""
+    """The zero level by marching cubes of R samples per edge, with normals by the field's gradient; in model space."""
     from skimage.measure import marching_cubes
 
     axis = np.linspace(-_HALF_EDGE, _HALF_EDGE, resolution)

@@ -44,7 +44,7 @@ def evaluation_outputs(
     traced: TracedObject, camera: Cameras, batch: dict[str, Tensor], *, samples: int, bounces: int
 ) -> dict[str, Float[Tensor, "H W C"]]:
     """`light` and `base_colour`, both linear, and `parameters` of the material where pixels count, 0 elsewhere; in the
-    light that the batch may hold, by so many paths a pixel."""
+    light that the batch may hold, by so many paths per pixel."""
     if "environment" in batch:
         light = Environment(batch["environment"], *batch["environment_placement"].tolist())
         traced = replace(traced, environment=light)

@@ -225,7 +225,7 @@ class TrainedObject:
         return read_environment(path, bands=self.bands, lamp=self.lamp.cpu().double().numpy())
 
     def look(self, camera: Cameras, subpixels: int | None = None) -> ModelView:
-        """All outputs of a view; `subpixels` squared rays a pixel."""
+        """All outputs of a view; `subpixels` squared rays per pixel."""
         rays = _SUBPIXELS if subpixels is None else subpixels
         return self._rendered(camera, rays, self.samples, 0)
 

@@ -9,7 +9,7 @@ on the materials.
 Random numbers are uniform for each path, and evenly spread over the paths of a point: a Sobol sequence over the samples
 is shifted by random numbers of each point (modulo 1).
 
-Notation: `R` rays, `N` points, S samples a point, `M` vertices of paths that are alive, `C` colours, `P` parameters,
+Notation: `R` rays, `N` points, S samples per point, `M` vertices of paths that are alive, `C` colours, `P` parameters,
 `H x W` pixels, `K` rays of a picture that meet the mesh.
 
 Source: Veach 1997, Robust Monte Carlo Methods for Light Transport Simulation, chapter 9; Zeltner et al. 2021, Monte

@@ -202,7 +202,7 @@ def render_view(
     lamp: _Place = LAMP_POSITION,
     sky: Sky | None = None,
 ) -> ViewCoefficients:
-    """Look at things through one camera with `subpixels`^2 rays a pixel; `lamp` is the middle of its disc."""
+    """Look at things through one camera with `subpixels`^2 rays per pixel; `lamp` is the middle of its disc."""
     count = subpixels**2
     pixels = cameras.height * cameras.width
     coverage = np.zeros(pixels, dtype=np.float32)

@@ -207,7 +207,7 @@ def _read_svc(path: Path, lines: Sequence[str]) -> MeasuredSpectra:
     table = table_in(path, lines[begin + 1 :], " ")
     if table.values.shape[1] != 4:
         raise SpectrumError(
-            f"{table.values.shape[1]} numbers a line; Spectra Vista writes wavelength, reference, target, reflectance"
+            f"{table.values.shape[1]} numbers per line; Spectra Vista writes wavelength, reference, target, reflectance"
         )
     nm, _, _, percent = table.values.T
     name = next((line.partition("=")[2].strip() for line in lines[:begin] if line.startswith("name")), "")
