@@ -1,5 +1,5 @@
-"""Layout `cubes`: a folder with one spectral file per view, one folder of band files per view, or a tree of such folders
-as instruments write them.
+"""Layout `cubes`: a folder with one spectral file per view, one folder of band files per view, or a tree of such
+folders as instruments write them.
 
 Files with the name of a cube and a suffix of a picture are its RGB picture. Where there are pictures alone, they are
 the views: three bands, gamma-encoded.

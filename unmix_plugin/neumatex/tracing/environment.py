@@ -54,7 +54,8 @@ class Environment:
 
         A pixel is drawn by its mean radiance and solid angle; within it, directions are uniform in solid angle. An
         alias table would be as fast, but scatter numbers that are evenly spread: with 160 samples per point the noise
-        of pictures would be twice as large. Uniforms are in [0, 1); float64 ones place directions more finely in a pixel.
+        of pictures would be twice as large. Uniforms are in [0, 1); float64 ones place directions more finely in a
+        pixel.
         """
         height, width = self.image.shape[:2]
         rows, columns, down, across = self._pixels.draw(uniforms)
