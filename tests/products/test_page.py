@@ -65,7 +65,7 @@ def test_a_page_of_an_edited_run_says_so_and_one_that_can_not_be_small_that(expo
     assert f"the page has {path.stat().st_size / 1e6:.1f} MB, more than a mail takes" in said
 
 
-def test_a_library_is_given_in_full_and_too_large_or_strange_ones_are_refused(tmp_path, monkeypatch):
+def test_a_library_is_given_in_full_and_too_large_or_strange_ones_are_refused(tmp_path):
     bands = SCENE.bands
     own = tmp_path / "own.csv"
     spectra = np.random.default_rng(0).random((3, len(bands)))
@@ -74,8 +74,9 @@ def test_a_library_is_given_in_full_and_too_large_or_strange_ones_are_refused(tm
     assert facts["known"] == [{"name": name, "source": "own.csv"} for name in ("a", "b<script>", "c")]
     with pytest.raises(SpectrumError, match="can't read"):
         export(tmp_path, library=(tmp_path / "none.csv",))
-    monkeypatch.setattr(page, "_MOST_KNOWN", 2)
-    with pytest.raises(ConfigError, match="the library has 3 spectra; a page has room for 2"):
+    names = tuple(f"sample {number}" for number in range(4001))
+    write_spectra_csv(own, SpectraTable(bands, names, np.full((4001, len(bands)), 0.5)))
+    with pytest.raises(ConfigError, match="the library has 4001 spectra; a page has room for 4000"):
         export(tmp_path, library=(own,))
 
 

@@ -21,7 +21,6 @@ from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.engine.model import TrainingCallback, TrainingCallbackLocation, TrainOutputs
 from unmix_plugin.engine.runs.checkpoints import newest_complete_checkpoint
 from unmix_plugin.engine.runs.load_run import load_model
-from unmix_plugin.engine.training import optimizers as guards
 from unmix_plugin.engine.training.optimizers import (
     GradientGuard,
     ParameterAverage,
@@ -150,14 +149,12 @@ def test_a_bad_loss_or_any_one_bad_gradient_entry_is_refused(bad):
     assert guard.check(torch.tensor(1.0))[0] is True
 
 
-def test_only_refusals_in_a_row_end_training(monkeypatch):
-    monkeypatch.setattr(guards, "_MAX_IN_A_ROW", 2)
+def test_only_refusals_in_a_row_end_training():
     guard, _ = make_guard()
-    for loss in (math.nan, 1.0, math.nan, 1.0):
+    for loss in (math.nan, 1.0) * 25 + (math.nan,) * 19:
         guard.check(torch.tensor(loss))
-    assert guard.skipped == 2
-    guard.check(torch.tensor(math.nan))
-    with pytest.raises(RunError, match="2 training steps in a row had a non-finite loss"):
+    assert guard.skipped == 25 + 19
+    with pytest.raises(RunError, match="20 training steps in a row had a non-finite loss"):
         guard.check(torch.tensor(math.nan))
 
 
@@ -191,13 +188,13 @@ def test_a_poisoned_step_changes_no_parameter_and_is_counted_and_logged(short_co
     assert '"loss": null' in trainer.run.metrics_path.read_text()
 
 
-def test_training_that_stays_poisoned_ends_with_the_last_checkpoint_whole(short_config, monkeypatch):
-    monkeypatch.setattr(guards, "_MAX_IN_A_ROW", 3)
-    trainer = poisoned_trainer(short_config, set(range(6, 100)))
-    with pytest.raises(RunError, match="3 training steps in a row"):
+def test_training_that_stays_poisoned_ends_with_the_last_checkpoint_whole(short_config):
+    config = replace(short_config, max_num_iterations=40)
+    trainer = poisoned_trainer(config, set(range(6, 100)))
+    with pytest.raises(RunError, match="20 training steps in a row"):
         trainer.train()
     checkpoint = newest_complete_checkpoint(trainer.run.checkpoints)
-    assert checkpoint.step == 8
+    assert checkpoint.step == 24  # of every fourth step
     assert all(tensor.isfinite().all() for tensor in checkpoint.tensors.values())
 
 
