@@ -147,8 +147,7 @@ def test_a_turn_of_training_that_has_not_begun_comes_after_the_viewers_turn_unde
 
     with device.viewing_turn():
         training = in_background(warm_up)
-        while not device._waiting["training"]:
-            time.sleep(0)
+        wait_for(lambda: device.num_waiting("training") == 1)
     for _ in range(3):
         with device.viewing_turn():
             order.append("viewer")
@@ -169,7 +168,7 @@ def test_viewers_have_their_turns_in_the_order_in_which_they_asked():
         viewers = []
         for name in ("page", "picture"):
             viewers.append(in_background(lambda name=name: draw(name, 5)))
-            wait_for(lambda: len(device._waiting["viewer"]) == len(viewers))
+            wait_for(lambda: device.num_waiting("viewer") == len(viewers))
     for viewer in viewers:
         viewer.join(120)
     assert order == ["page", "picture"] * 5
@@ -225,12 +224,18 @@ def test_a_viewer_on_the_device_changes_nothing_of_a_training(short_config, aver
 def test_a_pause_stops_the_steps_and_the_clock_until_it_is_over(short_config):
     out = io.StringIO()
     trainer = Trainer(short_config, console=Console(file=out))
-    control, owners = trainer.control, []
-    trainer.pipeline.model.warm_up = lambda: owners.append(control.device._owner)
+    control, warmed = trainer.control, []
+
+    def warm_up():  # kernels are compiled once, in a turn of training
+        with pytest.raises(RuntimeError, match="turns do not nest"), control.device.viewing_turn():
+            pass
+        warmed.append(threading.get_ident())
+
+    trainer.pipeline.model.warm_up = warm_up
     call_after_step(trainer, 5, control.pause)
     thread = in_background(trainer.train)
     wait_for(lambda: control.is_paused and trainer.step == 5)
-    assert owners == [thread.ident]  # kernels are compiled once, in a turn of training
+    assert warmed == [thread.ident]
     assert control.is_running
     assert not control.device.is_training
     seconds = trainer.seconds

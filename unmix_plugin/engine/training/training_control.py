@@ -91,6 +91,10 @@ class DeviceLock:
         with self._turn:
             self._earn(-seconds)
 
+    def num_waiting(self, who: Literal["training", "viewer"]) -> int:
+        """How many threads wait for their turn."""
+        return len(self._waiting[who])
+
     @property
     def viewing_may_go(self) -> bool:
         """Whether the viewer need not wait for credit."""
@@ -98,11 +102,11 @@ class DeviceLock:
 
     @property
     def _viewing_goes_first(self) -> bool:
-        return bool(self._waiting["viewer"]) and self.viewing_may_go and not self._training_goes_first
+        return self.num_waiting("viewer") > 0 and self.viewing_may_go and not self._training_goes_first
 
     @property
     def _training_goes_first(self) -> bool:
-        return bool(self._waiting["training"]) and self._last == "viewer" and not self._is_training
+        return self.num_waiting("training") > 0 and self._last == "viewer" and not self._is_training
 
     @contextmanager
     def _turn_of(
