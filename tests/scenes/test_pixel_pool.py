@@ -1,17 +1,13 @@
 import pytest
 import torch
 
-from unmix_plugin.scenes import pixel_pool
 from unmix_plugin.scenes.pixel_pool import PixelPool
 
 PIXELS = 1000
 
 
-@pytest.fixture(autouse=True)
-def small_chunks(monkeypatch):
-    """Chunks of 40 pixels of 4 bytes, each of two steps."""
-    monkeypatch.setattr(pixel_pool, "_CHUNK_BYTES", 160)
-    monkeypatch.setattr(pixel_pool, "_PIXELS_PER_STEP", 20)
+SMALL = {"chunk_bytes": 160, "pixels_per_step": 20}
+"""Chunks of 40 pixels of 4 bytes, each of two steps."""
 
 
 def make_pool(valid=None, num_bytes=4000, reads=None) -> PixelPool:
@@ -22,7 +18,9 @@ def make_pool(valid=None, num_bytes=4000, reads=None) -> PixelPool:
             reads.append((first, last))
         return values[first:last]
 
-    return PixelPool(torch.ones(PIXELS, dtype=torch.bool) if valid is None else valid, 4, num_bytes, read)
+    return PixelPool(
+        torch.ones(PIXELS, dtype=torch.bool) if valid is None else valid, 4, num_bytes, read, **SMALL
+    )
 
 
 def draw(pool: PixelPool, step: int, count: int = 20) -> torch.Tensor:
@@ -82,6 +80,6 @@ def test_an_error_of_the_disk_is_said_where_pixels_are_drawn():
     def fail(first: int, last: int) -> torch.Tensor:
         raise OSError(f"the disk is gone: {first} to {last}")
 
-    pool = PixelPool(torch.ones(PIXELS, dtype=torch.bool), 4, 4000, fail)
+    pool = PixelPool(torch.ones(PIXELS, dtype=torch.bool), 4, 4000, fail, **SMALL)
     with pytest.raises(OSError, match="the disk is gone"):
         draw(pool, 0)

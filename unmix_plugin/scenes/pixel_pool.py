@@ -15,12 +15,9 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-_CHUNK_BYTES = 4 << 20
-"""Of values read at once."""
+_CHUNK_BYTES, _PIXELS_PER_STEP = 4 << 20, 2048
 _PLACE_BYTES = 16
 """Of a pixel that is held, beside its values: its number, and its place among those that can be drawn."""
-_PIXELS_PER_STEP = 2048
-"""Drawn in a usual step: so many pixels are renewed in it, too."""
 _CHUNKS_AHEAD = 4
 """Read before they are needed."""
 _ORDER_SEED = 23
@@ -35,6 +32,9 @@ class PixelPool:
         pixel_bytes: int,
         num_bytes: int,
         read: Callable[[int, int], Tensor],
+        *,
+        chunk_bytes: int | None = None,
+        pixels_per_step: int | None = None,
     ) -> None:
         """
         Args:
@@ -42,15 +42,17 @@ class PixelPool:
             pixel_bytes: Of a pixel's values.
             num_bytes: Memory of the pool; at least two chunks are held.
             read: Stored values (pixels, b) from a first pixel to one before a last, called in another thread.
+            chunk_bytes: Of values read at once.
+            pixels_per_step: Drawn in a usual step: so many pixels are renewed in it, too.
         """
-        self._chunk_pixels = max(1, min(_CHUNK_BYTES // pixel_bytes, len(valid)))
+        self._chunk_pixels = max(1, min((chunk_bytes or _CHUNK_BYTES) // pixel_bytes, len(valid)))
         firsts = range(0, len(valid), self._chunk_pixels)
         self._firsts = [first for first in firsts if bool(valid[first : first + self._chunk_pixels].any())]
         held_bytes = self._chunk_pixels * (pixel_bytes + _PLACE_BYTES)
         self._num_held = min(len(self._firsts), max(2, num_bytes // held_bytes))
         self.num_bytes = self._num_held * self._chunk_pixels * pixel_bytes
         """Memory that the values held take."""
-        self._steps_per_chunk = max(1, self._chunk_pixels // _PIXELS_PER_STEP)
+        self._steps_per_chunk = max(1, self._chunk_pixels // (pixels_per_step or _PIXELS_PER_STEP))
         self._valid, self._read = valid, read
         self._reader = ThreadPoolExecutor(1, thread_name_prefix="pixels")
         self._arriving: dict[int, Future[Tensor]] = {}

@@ -313,25 +313,22 @@ def _cubes_below(root: Path, excluded: set[Path]) -> dict[Path, list[Path]]:
 
 def _names(paths: Sequence[Path]) -> list[str]:
     """Names of views. Raises CaptureError: two have the same."""
+    names = [safe_name(_stem(path), fallback="view") for path in paths]
     owners: dict[str, Path] = {}
-    for path in paths:
-        other = owners.setdefault(_name(path).casefold(), path)
+    for name, path in zip(names, paths, strict=True):
+        other = owners.setdefault(name.casefold(), path)
         if other is not path:
             raise CaptureError(_same_name(other, path))
-    return [_name(path) for path in paths]
+    return names
 
 
 def _same_name(first: Path, second: Path) -> str:
-    return f"{first} and {second} would both be the view '{_name(first)}'; rename or move one of them"
+    name = safe_name(_stem(first), fallback="view")
+    return f"{first} and {second} would both be the view '{name}'; rename or move one of them"
 
 
 def _visible_files(folder: Path) -> list[Path]:
     return sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
-
-
-def _name(path: Path) -> str:
-    """The stem, with only what is fit for any file system."""
-    return safe_name(_stem(path), fallback="view")
 
 
 def _stem(path: Path) -> str:

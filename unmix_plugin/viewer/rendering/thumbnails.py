@@ -13,15 +13,15 @@ from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 
-_ROWS = 96
 _MOST_KEPT = 512
 
 
 class Thumbnails:
     """Small sRGB images of the views of a scene, by name; may be asked by several threads."""
 
-    def __init__(self, scene: Scene) -> None:
-        self._scene = scene
+    def __init__(self, scene: Scene, rows: int = 96) -> None:
+        """Images have at least so many rows, where the views do."""
+        self._scene, self._rows = scene, rows
         self._index_of = {frame.name: index for index, frame in reversed(list(enumerate(scene.frames)))}
         self._kept: dict[str, UInt8[np.ndarray, "H W 3"]] = {}
         self._reading = threading.Lock()
@@ -38,7 +38,7 @@ class Thumbnails:
 
     def _read(self, index: int) -> UInt8[np.ndarray, "H W 3"]:
         scene = self._scene
-        step = max(1, scene.cameras[index].height // _ROWS)
+        step = max(1, scene.cameras[index].height // self._rows)
         every = (slice(None, None, step), slice(None, None, step))
         picture = scene.srgb(index)
         if picture is not None:
