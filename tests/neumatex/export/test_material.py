@@ -12,7 +12,6 @@ from tests.factories.outputs import loaded_mesh
 from tests.factories.surfaces import LAYERED, PBR, TURN, ball, eye_directions, generator, knot
 from tests.factories.systems import needs_xatlas
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.neumatex.export import pbr_fit
 from unmix_plugin.neumatex.export.material import material_paths, write_material
 from unmix_plugin.neumatex.export.pbr_fit import fit_pbr
 from unmix_plugin.neumatex.export.product import MaterialProduct
@@ -135,28 +134,26 @@ def fit_error(parameters, pbr):
     return float((truth.log1p() - found.log1p()).abs().mean() / truth.log1p().mean())
 
 
-def test_layered_materials_get_a_gltf_material_much_like_them_the_same_each_time(monkeypatch):
-    monkeypatch.setattr(pbr_fit, "_MATERIALS", 64)
+def test_layered_materials_get_a_gltf_material_much_like_them_the_same_each_time():
     parameters = LAYERED.parameters(ball().vertices)
-    fitted, error = fit_pbr(LayeredFamily(), parameters, generator())
+    fitted, error = fit_pbr(LayeredFamily(), parameters, generator(), num_materials=64)
     assert 0 <= fitted.min() <= fitted.max() <= 1
     plain = torch.cat([parameters[:, :3], parameters[:, [4, 3]]], dim=1)  # layers left out
     assert 0.01 < error < 0.2
     assert fit_error(parameters, fitted) < 0.7 * fit_error(parameters, plain)
-    monkeypatch.setattr(pbr_fit, "_STEPS", 5)
-    first, again = (fit_pbr(LayeredFamily(), parameters, generator())[0] for _ in range(2))
+    first, again = (fit_pbr(LayeredFamily(), parameters, generator(), 5, 64)[0] for _ in range(2))
     torch.testing.assert_close(first, again, rtol=0, atol=0)
 
 
-def test_a_layered_material_that_is_a_gltf_one_is_found_again(monkeypatch):
-    monkeypatch.setattr(pbr_fit, "_MATERIALS", 64)
+def test_a_layered_material_that_is_a_gltf_one_is_found_again():
     g = generator(1)
     parameters = torch.zeros(400, 14)
     parameters[:, :3] = 0.2 + 0.6 * torch.rand(400, 3, generator=g)
     parameters[:, 3] = (torch.rand(400, generator=g) > 0.5).float()
     parameters[:, 4] = 0.3 + 0.5 * torch.rand(400, generator=g)
     parameters[:, 5] = 0.5
-    errors = (fit_pbr(LayeredFamily(), parameters, g)[0] - parameters[:, [0, 1, 2, 4, 3]]).abs().mean(dim=0)
+    fitted, _ = fit_pbr(LayeredFamily(), parameters, g, num_materials=64)
+    errors = (fitted - parameters[:, [0, 1, 2, 4, 3]]).abs().mean(dim=0)
     assert (errors < torch.tensor([0.06] * 4 + [0.1])).all()
 
 

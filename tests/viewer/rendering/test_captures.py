@@ -25,7 +25,7 @@ from unmix_plugin.trained.mixture_view import picture_values
 from unmix_plugin.trained.model_scene import LightChoice
 from unmix_plugin.trained.outputs import find_output
 from unmix_plugin.trained.run_views import RunView
-from unmix_plugin.viewer.rendering import captures, render_loop
+from unmix_plugin.viewer.rendering import captures
 from unmix_plugin.viewer.rendering.captures import VideoJob, VideoQueue
 from unmix_plugin.viewer.rendering.painting import LAYERS
 from unmix_plugin.viewer.rendering.scene import Edit
@@ -42,22 +42,21 @@ def services(source):
     running.stop()
 
 
-def captured(services, camera, read=lambda strip: strip):
+def captured(services, camera, read=lambda strip: strip, most_pixels=None):
     """What is read of the strips of a picture, and the parts told."""
     parts = []
-    strips = services.loop.strips(camera, Edit(), 1, threading.Event(), parts.append)
+    strips = services.loop.strips(camera, Edit(), 1, threading.Event(), parts.append, most_pixels)
     return [read(strip) for strip in strips], parts
 
 
 @pytest.mark.parametrize("layer", ["rgb", "depth", "segmentation"])
-def test_strips_make_up_the_picture_of_the_whole(services, source, monkeypatch, layer):
-    monkeypatch.setattr(render_loop, "_STRIP_PIXELS", 100)
+def test_strips_make_up_the_picture_of_the_whole(services, source, layer):
     camera, settings = sized_camera(some_pose(), 31, 23), LayerSettings(layer=layer)
 
     def paint(frame):
         return services.maker.paint(frame, settings, False, False).picture.astype(int)
 
-    pictures, parts = captured(services, camera, paint)
+    pictures, parts = captured(services, camera, paint, most_pixels=100)
     assert len(parts) >= 8
     assert parts == sorted(parts)
     assert parts[-1] == pytest.approx(1.0)
@@ -65,14 +64,13 @@ def test_strips_make_up_the_picture_of_the_whole(services, source, monkeypatch, 
 
 
 @pytest.mark.parametrize("is_line", [False, True])
-def test_spectra_of_strips_are_those_of_the_whole(services, source, monkeypatch, is_line):
-    monkeypatch.setattr(render_loop, "_STRIP_PIXELS", 64)
+def test_spectra_of_strips_are_those_of_the_whole(services, source, is_line):
     camera = sized_camera(some_pose(), 17, 13)
     if is_line:
         ends = torch.cat([camera.camera_to_world, sized_camera(some_pose(1), 17, 13).camera_to_world])
         camera = replace(camera, key_poses=KeyPoses(ends, torch.tensor([0.5, 12.5]), (2,)))
     frame = make_frame(source, camera)
-    strips, _ = captured(services, camera, captures.strip_of_spectra)
+    strips, _ = captured(services, camera, captures.strip_of_spectra, most_pixels=64)
     assert len(strips) > 1
     for found, expected in zip(
         captures.joined_strips(strips, 13), captures.strip_of_spectra(frame), strict=True

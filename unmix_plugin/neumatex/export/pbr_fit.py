@@ -15,14 +15,18 @@ from torch import Tensor, nn
 from unmix_plugin.neumatex.tracing.families import MaterialFamily, PbrFamily
 from unmix_plugin.neumatex.tracing.microfacet import cosine_directions
 
-_STEPS, _MATERIALS, _DIRECTIONS, _WIDTH = 300, 256, 16, 48
+_STEPS, _DIRECTIONS, _WIDTH = 300, 16, 48
 _CHUNK = 1 << 16
 _JUDGED = 512
 """Materials whose error is measured."""
 
 
 def fit_pbr(
-    family: MaterialFamily, parameters: Float[Tensor, "T P"], generator: torch.Generator
+    family: MaterialFamily,
+    parameters: Float[Tensor, "T P"],
+    generator: torch.Generator,
+    steps: int | None = None,
+    num_materials: int = 256,
 ) -> tuple[Float[Tensor, "T 5"], float]:
     """Base colour, roughness and metallicity of materials; those of `PbrFamily` stay as they are.
 
@@ -30,6 +34,8 @@ def fit_pbr(
         family: Of the materials, in three colours.
         parameters: [0, 1].
         generator: For the drawn materials and directions, on the CPU.
+        steps: Of the network's training; None for as many as it takes.
+        num_materials: Drawn in each step.
     Returns:
         Parameters of `PbrFamily`, and the mean absolute difference of reflected light x, cosine included, between all
         directions, as a part of its mean; light is compressed to x / (1 + x), as by an eye.
@@ -39,8 +45,23 @@ def fit_pbr(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(torch.randint(1 << 31, (1,), generator=generator)))
         network = _Regression(family).to(parameters.device)
+    optimiser, steps, pbr = torch.optim.Adam(network.parameters(), lr=1e-2), steps or _STEPS, PbrFamily()
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
     with torch.enable_grad():
-        _train(network, family, parameters, generator)
+        for _ in range(steps):
+            chosen = torch.randint(len(parameters), (num_materials,), generator=generator)
+            materials = parameters[chosen.to(parameters.device)]
+            repeated = materials.repeat_interleave(_DIRECTIONS, dim=0)
+            wi, wo = _directions(family, repeated, generator)
+            with torch.no_grad():
+                target = _reflected(family, repeated, wi, wo)
+            found = _reflected(pbr, network(materials).repeat_interleave(_DIRECTIONS, dim=0), wi, wo)
+            # Highlights are thousands of times brighter than the rest; an eye, or a tone curve, compresses them.
+            loss = (found.log1p() - target.log1p()).abs().mean()
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+            schedule.step()
     with torch.no_grad():
         fitted = torch.cat([network(part) for part in parameters.split(_CHUNK)])
         return fitted, _mean_error(family, parameters, fitted, generator)
@@ -63,28 +84,6 @@ class _Regression(nn.Module):
         base = torch.logit(self._family.base_colour(parameters).detach(), eps=1e-3)
         shifts = self.layers(2 * parameters - 1)
         return torch.cat([base + shifts[:, :3], shifts[:, 3:]], dim=1).sigmoid()
-
-
-def _train(
-    network: _Regression, family: MaterialFamily, parameters: Float[Tensor, "T P"], generator: torch.Generator
-) -> None:
-    optimiser = torch.optim.Adam(network.parameters(), lr=1e-2)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, _STEPS)
-    pbr = PbrFamily()
-    for _ in range(_STEPS):
-        chosen = torch.randint(len(parameters), (_MATERIALS,), generator=generator).to(parameters.device)
-        materials = parameters[chosen]
-        repeated = materials.repeat_interleave(_DIRECTIONS, dim=0)
-        wi, wo = _directions(family, repeated, generator)
-        with torch.no_grad():
-            target = _reflected(family, repeated, wi, wo)
-        found = _reflected(pbr, network(materials).repeat_interleave(_DIRECTIONS, dim=0), wi, wo)
-        # Highlights are thousands of times brighter than the rest; an eye, or a tone curve, compresses them.
-        loss = (found.log1p() - target.log1p()).abs().mean()
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-        schedule.step()
 
 
 def _reflected(family: MaterialFamily, parameters: Tensor, wi: Tensor, wo: Tensor) -> Tensor:

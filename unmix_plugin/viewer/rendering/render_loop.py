@@ -141,11 +141,13 @@ class RenderLoop:
         subpixels: int,
         cancelled: threading.Event,
         show: Callable[[float], None] = lambda _: None,
+        most_pixels: int | None = None,
     ) -> Iterator[RenderedView]:
         """A picture of any size apart from any view: strips from top to bottom, each rendered in the caller's thread
-        when nothing is more urgent, in turn with other such pictures. `show` is told the part that is rendered; a
-        ConfigError once it is `cancelled` or the loop stopped, another UnmixError if the edit does not fit the run."""
-        rows = max(1, _STRIP_PIXELS // camera.width)
+        when nothing is more urgent, in turn with other such pictures. `show` is told the part that is rendered; a strip
+        has at most `most_pixels` where its width allows. A ConfigError once it is `cancelled` or the loop stopped,
+        another UnmixError if the edit does not fit the run."""
+        rows = max(1, (most_pixels or _STRIP_PIXELS) // camera.width)
         for first in range(0, camera.height, rows):
             part = camera.crop(0, first, camera.width, min(rows, camera.height - first))
             render, frame = FrameRender(part, subpixels, is_finished=True), None
