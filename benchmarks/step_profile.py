@@ -45,6 +45,7 @@ RENDERED = {"object": "table", "room": "room"}
 _FRAME_ROWS, _RECORDED, _MOST_LISTED = 512, 10, 12
 _FIRST_STEP = """
 import os, sys
+import unmix_plugin.commands.scripts  # with what it sets for all commands
 from unmix_plugin.commands.train import parse
 from unmix_plugin.engine.training.steps import prepare_steps
 steps = prepare_steps(parse(sys.argv[1:])[0])[1]
