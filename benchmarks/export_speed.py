@@ -10,6 +10,9 @@ once with every format that suits it. Takes about five minutes.
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 import tempfile
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -51,6 +54,30 @@ PRODUCTS = {
 }
 
 
+AS_FAST = _common.Limit(1.5, is_upper=True, unit=" times")
+_FOUR_VIEWS = (
+    "--cameras",
+    "dataset-train",
+    "--view",
+    "0",
+    "1",
+    "2",
+    "3",
+    "--size",
+    "512x512",
+    "--outputs",
+    "rgb",
+)
+_FROM_PYTHON = """
+import sys
+import unmix_plugin
+scene = unmix_plugin.open_run(sys.argv[1], device=sys.argv[2])
+for view in scene.views[-4:]:
+    scene.look(view.camera.resized(512, 512))["rgb"].cpu()
+"""
+"""As many views by the library."""
+
+
 @dataclass(frozen=True)
 class Options:
     """Time what is made of a run of a scene."""
@@ -80,9 +107,19 @@ def main(options: Options) -> None:
         for what, product in PRODUCTS.items():
             print(f"{what} ...", flush=True)
             measured[what] = measure(run, product, options, folder / f"product-{len(measured)}")
+        ways = {
+            busy: four_views(run, options, folder / f"views-{busy}", busy)
+            for busy in (0, os.cpu_count() or 1)
+        }
     of = f"{setting['views']} evaluation views of {setting['size']}, {setting['bands']} bands"
+    figures = [*judge(measured), *judge_ways(ways)]
     report = _common.Report(
-        "export_speed", f"Products of a run with {of}", setting, machine, judge(measured), measured
+        "export_speed",
+        f"Products of a run with {of}",
+        setting,
+        machine,
+        figures,
+        {**measured, "four views": ways},
     )
     _common.publish(report, _common.results_folder(options.results, options.quick))
 
@@ -130,6 +167,42 @@ def measure(run: Path, product: Product, options: Options, output: Path) -> dict
         "megabytes": sum(path.stat().st_size for path in written) / 1e6,
         "peak_gib": ended.peak_bytes / 2**30,
     }
+
+
+def four_views(run: Path, options: Options, output: Path, busy: int) -> dict[str, float]:
+    """Wall seconds for four views of 512 rows by the command and from Python, beside so many busy processes."""
+    by_command = [
+        _common.console_script("unmix-render"),
+        *_FOUR_VIEWS,
+        "--run",
+        str(run),
+        "--output",
+        str(output),
+    ]
+    ways = {
+        "by command": [*by_command, "--device", options.device],
+        "from Python": [sys.executable, "-c", _FROM_PYTHON, str(run), options.device],
+    }
+    others = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(busy)]
+    try:
+        return {way: _common.run_command(words).seconds for way, words in ways.items()}
+    finally:
+        for other in others:
+            other.kill()
+            other.wait()
+
+
+def judge_ways(ways: dict[int, dict[str, float]]) -> list[_common.Figure]:
+    """Whether the library is as fast as the command, on a busy machine, too."""
+    figures = []
+    for busy, seconds in ways.items():
+        beside = f"beside {busy} busy processes" if busy else "alone"
+        figures.append(
+            _common.reported(f"four views of 512 rows by command, {beside}", f"{seconds['by command']:.1f} s")
+        )
+        ratio = seconds["from Python"] / seconds["by command"]
+        figures.append(AS_FAST.judge(f"the same from Python, {beside}", ratio))
+    return figures
 
 
 def judge(measured: dict[str, dict[str, Any]]) -> list[_common.Figure]:
