@@ -3,6 +3,8 @@
 import os
 import subprocess
 import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
 from typing import no_type_check
 
 import pytest
@@ -12,7 +14,7 @@ from torch.testing import assert_close
 
 from unmix_plugin.operators.compositing import accumulate, volume_weights
 from unmix_plugin.operators.hash_encoding import HashGridLayout, hash_encode
-from unmix_plugin.operators.launching import as_warp, launch, vector_type
+from unmix_plugin.operators.launching import as_warp, launch, vector_type, warp
 from unmix_plugin.operators.marching import rays_in_box
 from unmix_plugin.operators.occupancy import skip_distances
 
@@ -114,3 +116,17 @@ def everything_from(generator: torch.Generator) -> tuple[torch.Tensor, ...]:
     gradients = torch.autograd.grad(totals, (table, depths), cotangent)
     assert_close(samples.packed_info[:, 1].sum().item(), len(samples))
     return samples.t, samples.packed_info, encoded.detach(), totals.detach(), *gradients
+
+
+def test_threads_that_need_warp_first_at_once_leave_the_process_its_standard_error(monkeypatch):
+    monkeypatch.setattr(wp, "init", lambda: time.sleep(0.05))  # as long as a real one
+    before = os.fstat(2)
+
+    def first(turn: int) -> None:
+        time.sleep(0.01 * turn)
+        warp.__wrapped__()
+
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(first, range(4)))
+    after = os.fstat(2)
+    assert (after.st_dev, after.st_ino) == (before.st_dev, before.st_ino)

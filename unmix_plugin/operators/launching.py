@@ -36,6 +36,7 @@ _KERNELS_BYTES = 1 << 22
 
 _RECORDED: dict[Any, Any] = {}
 """A launch of each kernel on a CPU, without its arguments."""
+_LOADING = Lock()
 _PACKING = Lock()
 """Packing parameters and loading modules is not thread-safe in Warp, running a packed launch is."""
 
@@ -48,8 +49,9 @@ def warp() -> Any:
     settings: Any = wp.config
     settings.quiet = True
     settings.log_level = getattr(wp, "LOG_ERROR", None)
-    # Without a GPU the native library warns on standard error that there is no driver.
-    with nullcontext() if torch.cuda.is_available() else _standard_error_closed():
+    # Without a GPU the native library warns on standard error that there is no driver. Two threads may need Warp first:
+    # each would take the other's closed standard error for its own, and the process had none from then on.
+    with _LOADING, nullcontext() if torch.cuda.is_available() else _standard_error_closed():
         is_kept = _is_initialised(wp)
         if not is_kept:
             settings.kernel_cache_dir = tempfile.mkdtemp(prefix="unmix-kernels-")
