@@ -495,3 +495,40 @@ def test_previews_beside_cubes_are_left_out_and_named(of_cube, tmp_path):
     scene.check_values(lambda name: cube(int(name.split("_")[1])))
     scene.check_poses(lambda name: pose_of(name.removesuffix("_cube")))
     assert "session_000_pan.tiff, session_000_view.tiff" in scene.printed
+
+
+@pytest.mark.parametrize("empty", [np.nan, -9999.0])
+def test_a_band_that_is_marked_as_bad_changes_nothing_but_itself(empty, tmp_path):
+    """Atmospheric correction leaves bands without a number; the exposures of its floats stay those of the raw files."""
+    for index in range(VIEWS):
+        values = cube(index).astype(np.float32)
+        values[..., 2] = empty
+        entries = {"tint": 10 + 10 * (index % 2), "bbl": "{1, 1, 0, 1, 1, 1, 1}", "data_ignore_value": -9999}
+        write_envi(tmp_path / "capture" / f"view_{index}.hdr", values, **entries)
+    write_transforms(tmp_path / "capture/transforms.json", [f"view_{index}" for index in range(VIEWS)])
+    given = "cubes", "--data", tmp_path / "capture", "--poses", "transforms.json"
+    scene = processed(*given, output=tmp_path / "scene")
+    scene.check_values(lambda name: np.delete(cube_of(name), 2, axis=2))
+
+
+@pytest.mark.parametrize("dtype", [np.int16, np.float32])
+def test_a_no_data_value_that_no_file_names_is_said(dtype, tmp_path):
+    for index in range(VIEWS):
+        values = np.rint(cube(index) * 10000).astype(dtype)
+        values[3:6] = -9999
+        entries = {"reflectance_scale_factor": 10000}
+        write_envi(tmp_path / "capture" / f"view_{index}.hdr", values, **entries)
+    write_transforms(tmp_path / "capture/transforms.json", [f"view_{index}" for index in range(VIEWS)])
+    given = "cubes", "--data", tmp_path / "capture", "--poses", "transforms.json"
+    said = processed(*given, output=tmp_path / "scene").printed
+    assert "many pixels hold -9999 in every band" in said
+    assert "dark frame is brighter" not in said
+
+
+def test_a_refusal_for_want_of_wavelengths_says_why_those_of_the_file_are_none(tmp_path):
+    for index in range(VIEWS):
+        entries = {"wavelength_units": "Micrometers"}
+        write_envi(tmp_path / "capture" / f"view_{index}.hdr", cube(index).astype(np.float32), **entries)
+    write_transforms(tmp_path / "capture/transforms.json", [f"view_{index}" for index in range(VIEWS)])
+    given = "cubes", "--data", tmp_path / "capture", "--poses", "transforms.json"
+    assert "450 to 900 can't be in Micrometers" in not_processed(*given, output=tmp_path / "scene")

@@ -109,6 +109,27 @@ def test_bands_that_were_measured_nowhere_are_left_out(cube, tmp_path):
     np.testing.assert_allclose(found, np.delete(bands.centers_nm, slice(5, 8)))
 
 
+@pytest.mark.parametrize("field", ["", "bbl = {0, " + "1, " * 22 + "1}"])
+def test_a_band_without_numbers_makes_no_raw_counts_of_reflectances(field, cube, tmp_path):
+    cube[..., 0] = np.nan
+    write_envi_cube(tmp_path / "a", cube, Bands.of(np.linspace(450, 900, cube.shape[2])), None, "a field")
+    with (tmp_path / "a.hdr").open("a") as header:
+        header.write(f"{field}\n")
+    said = done(image, tmp_path / "a.hdr", "--endmembers", 3, "--output-dir", tmp_path).out
+    assert "1 band left out" in said
+    assert "raw counts" not in said
+
+
+def test_a_no_data_value_that_the_file_does_not_name_is_said_and_noise_around_black_is_none(cube, tmp_path):
+    bands = Bands.of(np.linspace(450, 900, cube.shape[2]))
+    for number, is_said in ((-9999, True), (-0.001, False)):
+        cube[:3] = number
+        write_envi_cube(tmp_path / "a", cube, bands, None, "a field")
+        words = "--endmembers", 3, "--output-dir", tmp_path, "--overwrite"
+        said = done(image, tmp_path / "a.hdr", *words).out
+        assert (f"many pixels hold {number:g} in every band" in said) == is_said
+
+
 def test_a_matrix_of_bands_and_pixels_is_an_image_by_its_size(cube, tmp_path):
     savemat(tmp_path / "list.mat", {"Y": cube.reshape(-1, 24, order="F").T})
     ended = done(image, tmp_path / "list.mat", "--size", 20, 20, "--endmembers", 3, "--output-dir", tmp_path)

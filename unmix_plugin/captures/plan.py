@@ -24,6 +24,7 @@ from unmix_plugin.captures.calibration.calibration import (
     bright_values,
     count_stored,
     draw_pixels,
+    find_unnamed_no_data,
     rows_behind,
 )
 from unmix_plugin.captures.calibration.references import GivenReferences, find_references
@@ -324,7 +325,7 @@ def plan_sensor(
             [white.file for white in references.whites],
             references.darks_beside(files),
             is_srgb=first.is_srgb,
-            may_be_reflectance=may_be_reflectance(first, bright_values(files)),
+            may_be_reflectance=may_be_reflectance(first, bright_values(files, bands.kept)),
         )
         compared = compare_exposures(exposed)
 
@@ -351,6 +352,8 @@ def plan_sensor(
     bands, found = without_bad(bands, values, saturated, options.max_noise)
     bands = bands.without_incomplete_bins(binning)
     bands.require(binning, str(first.path))
+    if (number := find_unnamed_no_data(files, bands.kept)) is not None:
+        remarks.append(Remark.of(Code.NO_DATA_UNNAMED, number=f"{number:g}"))
     still_kept = np.isin(calibration.bands, bands.kept)
     at_end = values[:, still_kept][saturated[:, still_kept]]
     lamp = None
@@ -392,19 +395,22 @@ def with_one_exposure(sensors: dict[str, SensorPlan], first: dict[str, Cube]) ->
         return sensors
     known = {name: exposure for name, exposure in bare.items() if exposure is not None}
     rest = [name for name in bare if name not in known]
-    files = [
-        first[name]
+    files = {
+        name: first[name]
         for name in known or rest
         if radiometric_model(first[name]) is None
         # What is wrong with those of one sensor was said of it.
         and (first[name].total_exposure() is not None or first[name].exposure.time is None)
-    ]
+    }
     if not files:
         return sensors
     exposed = ExposedFiles(
-        files,
-        is_srgb=any(file.is_srgb for file in files),
-        may_be_reflectance=any(may_be_reflectance(file, bright_values([file])) for file in files),
+        [*files.values()],
+        is_srgb=any(file.is_srgb for file in files.values()),
+        may_be_reflectance=any(
+            may_be_reflectance(file, bright_values([file], sensors[name].bands.kept))
+            for name, file in files.items()
+        ),
     )
     compared = compare_exposures(exposed)
     common = compared.common
@@ -438,7 +444,8 @@ def _remarks_on_values(
             "hint": " (was the white exposed and lit as the views were?)" if has_white else "",
         }
         remarks.append(Remark(Code.ONE_LOST_ABOVE if scale.value > 1 else Code.ONE_LOST_BELOW, facts))
-    if any(is_below_black(sensor.sample) for sensor in sensors.values()):
+    named_already = any(remark.code is Code.NO_DATA_UNNAMED for remark in remarks)
+    if not named_already and any(is_below_black(sensor.sample) for sensor in sensors.values()):
         remarks.append(Remark.of(Code.BELOW_BLACK))
     remarks += on_mask
     kinds = {(meaning.has_one, meaning.states_one): meaning.description for meaning in meanings}

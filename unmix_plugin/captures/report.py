@@ -291,6 +291,10 @@ class Code(Enum):
         "values lie below 0 by more than noise, and are written as 0: the dark frame is brighter than that of these "
         "views, or was taken off their numbers before"
     )
+    NO_DATA_UNNAMED = _wrong(
+        "many pixels hold {number} in every band, which no light leaves, and count as measured: if that marks missing "
+        "pixels, name it in the files (ENVI: 'data ignore value = {number}'; GeoTIFF: GDAL's no-data value)"
+    )
     SATURATED_BELOW_ONE = _wrong(
         "values are saturated from {end} on, and are written as 1, which is read as at least {scale}: expose less, "
         "or make that true with --scale {end}, which cuts off all above"

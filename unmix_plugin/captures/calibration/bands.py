@@ -16,7 +16,7 @@ from unmix_plugin.captures.calibration.references import Reference
 from unmix_plugin.captures.cube import MOST_WIDTH, Cube
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.readers.derived import said_of_mosaic
-from unmix_plugin.captures.report import Code, Remark
+from unmix_plugin.captures.report import Code, Kind, Remark, sentences
 from unmix_plugin.captures.wavelengths import in_ranges
 from unmix_plugin.errors import CaptureError
 
@@ -135,9 +135,10 @@ def stated_bands(files: Sequence[Cube], options: ProcessOptions) -> BandChoice:
     ConfigError: bands that the user drops are no ranges."""
     table, num_bands = files[0].bands, files[0].shape[2]
     if table.wavelengths_nm is None:
+        notes = "".join(f". {note}" for note in sentences(files[0].remarks, Kind.WRONG))
         raise CaptureError(
             f"{files[0].path}: the wavelengths of its {num_bands} bands are unknown ({table.source}); give them with "
-            f"--wavelengths{said_of_mosaic(files[0])}"
+            f"--wavelengths{said_of_mosaic(files[0])}{notes}"
         )
     choice = BandChoice(table.wavelengths_nm, table.source)
     for file in files:

@@ -41,6 +41,11 @@ _BORDER_SHARE = 0.02
 _MOST_BORDER_PIXELS = 20000
 _BACKDROP_ROWS = 96
 """Of a view in which a backdrop is looked for."""
+_LEAST_UNNAMED, _UNNAMED_SHARE = 8, 0.001
+"""Sampled pixels, and share of them, that a no-data value must have which no file names."""
+_BELOW_NOISE, _OF_BRIGHT = 10.0, 0.01
+"""How much further below 0 than any other number it lies, and at least, as a share of bright numbers: noise around
+black has one number in every band, too, where bands are few."""
 
 
 @dataclass(frozen=True)
@@ -264,17 +269,38 @@ def count_stored(files: Sequence[Cube], bands: np.ndarray) -> StoredCounts:
     return StoredCounts(dtype, low, counts, len(known), len(varying))
 
 
-def bright_values(files: Sequence[Cube]) -> list[float]:
-    """Values of bright pixels of some files, as these state them, before any reference."""
+def bright_values(files: Sequence[Cube], bands: np.ndarray) -> list[float]:
+    """Values of bright pixels of some files at some bands, as these state them, before any reference."""
     bright = []
     for index in np.unique(np.linspace(0, len(files) - 1, min(len(files), _MOST_ALIKE + 1)).astype(int)):
         file = files[index]
         parts = [
-            (_stored_pixels(file, row)[None], slice(row, row + 1)) for row in sampled_rows(file.shape[0])
+            (_stored_pixels(file, row, bands)[None], slice(row, row + 1))
+            for row in sampled_rows(file.shape[0])
         ]
-        values = np.concatenate([stated_values(file, *part).ravel() for part in parts])
+        values = np.concatenate([stated_values(file, *part, bands).ravel() for part in parts])
         bright += [float(np.percentile(values, BRIGHT_PERCENTILE))] if len(values) else []
     return bright
+
+
+def find_unnamed_no_data(files: Sequence[Cube], bands: np.ndarray) -> float | None:
+    """The negative number that many sampled pixels have in every band, as no light leaves one, and that the files don't
+    name as their no-data value; None without one, or of one band."""
+    if len(bands) < 2 or files[0].dtype.kind == "u":
+        return None
+    rows = sampled_rows(files[0].shape[0])
+    stored = np.concatenate(
+        [_stored_pixels(file, row, bands) for file, row in product(files[:_MOST_ALIKE], rows)]
+    )
+    number = float(stored.min(initial=0))
+    is_number = stored == number
+    others = stored[~is_number] if number < 0 else stored[:0]
+    if len(others) == 0 or is_number.all(axis=1).sum() < max(_LEAST_UNNAMED, _UNNAMED_SHARE * len(stored)):
+        return None
+    is_below_noise = number < _BELOW_NOISE * float(others.min(initial=0))
+    return (
+        number if is_below_noise and -number > _OF_BRIGHT * np.percentile(others, BRIGHT_PERCENTILE) else None
+    )
 
 
 def _stored_pixels(file: Cube, row: int, bands: BandIndex = slice(None)) -> Shaped[np.ndarray, "P b"]:

@@ -18,6 +18,7 @@ from unmix_plugin.captures.calibration.calibration import (
     WhiteSample,
     bright_values,
     count_stored,
+    find_unnamed_no_data,
 )
 from unmix_plugin.captures.calibration.references import GivenReferences, SensorReferences, find_references
 from unmix_plugin.captures.cube import CaptureView, Cube, Meaning, find_missing
@@ -29,7 +30,7 @@ from unmix_plugin.captures.decide import (
     saturated_bands,
 )
 from unmix_plugin.captures.options import ProcessOptions
-from unmix_plugin.captures.report import Kind, sentences
+from unmix_plugin.captures.report import Code, Kind, Remark, sentences
 from unmix_plugin.captures.writing.view_files import read_view_masks
 from unmix_plugin.errors import CaptureError, ConfigError, counted
 
@@ -78,19 +79,22 @@ def calibrate_image(
     options = ProcessOptions("cubes", file.path, Path(), white_reflectance=white_reflectance)
     references = find_references([view], known, options, given, [view])
     choice, remarks = BandChoice(known, file.bands.source), []
-    saturation = find_saturation(count_stored([file], np.arange(num_bands))) if references.whites else None
+    bands = _good_bands(file)
+    saturation = find_saturation(count_stored([file], bands)) if references.whites else None
     for white in references.whites:
         stored = None if saturation is None else saturation.stored
         choice, found = without_unlit(choice, white, saturated_bands(WhiteSample.of(white), stored))
         remarks += found
     unlit = num_bands - len(choice.kept)
-    bands = _good_bands(file, choice.kept)
+    bands = bands[np.isin(bands, choice.kept)]
+    if len(bands) == 0:
+        raise CaptureError(f"{file.path}: the white has no light in any of its good bands")
     exposed = ExposedFiles(
         [file],
         [white.file for white in references.whites],
         references.darks_beside([file]),
         file.is_srgb,
-        may_be_reflectance(file, bright_values([file])),
+        may_be_reflectance(file, bright_values([file], bands)),
     )
     compared = compare_exposures(exposed)
     height, width, _ = file.shape
@@ -107,7 +111,9 @@ def calibrate_image(
     shown = read_view_masks(view, raster, use_opacity=False).valid
     saturated = rows.saturated.any(axis=-1)
     remarks += compared.remarks if references.whites else []
-    warnings = [*_doubts(file, references), *sentences(remarks, Kind.WRONG)]
+    if (number := find_unnamed_no_data([file], bands)) is not None:
+        remarks.append(Remark.of(Code.NO_DATA_UNNAMED, number=f"{number:g}"))
+    warnings = [*_doubts(file, bands, references), *sentences(remarks, Kind.WRONG)]
     used = next(iter(references.by_view.values()), references.common)
     named = (("dark frame", used.dark), ("white reference", used.white))
     notes = [f"{kind} {one.file.path.name}: {one.how}" for kind, one in named if one]
@@ -132,14 +138,12 @@ def calibrate_image(
     )
 
 
-def _good_bands(file: Cube, lit: np.ndarray) -> np.ndarray:
+def _good_bands(file: Cube) -> np.ndarray:
     """Bands that the file does not mark as bad, that are measured somewhere, and of one wavelength the first."""
     table = file.bands
-    kept = lit if table.bad is None else lit[~table.bad[lit]]
+    kept = np.arange(file.shape[2]) if table.bad is None else np.flatnonzero(~table.bad)
     if len(kept) == 0:
-        raise CaptureError(
-            f"{file.path}: the file marks all of its bands as bad, or the white has no light in them"
-        )
+        raise CaptureError(f"{file.path}: the file marks all of its bands as bad")
     if table.wavelengths_nm is not None:
         _, first = np.unique(table.wavelengths_nm[kept], return_index=True)
         kept = kept[first]
@@ -151,7 +155,7 @@ def _good_bands(file: Cube, lit: np.ndarray) -> np.ndarray:
     return kept if all(lacking) else kept[~np.array(lacking)]
 
 
-def _doubts(file: Cube, references: SensorReferences) -> list[str]:
+def _doubts(file: Cube, bands: np.ndarray, references: SensorReferences) -> list[str]:
     """That numbers are raw where they are, and references that are missing."""
     has_dark = any(used.dark is not None for used in (references.common, *references.by_view.values()))
     if references.whites and not has_dark and file.dtype.kind != "f":
@@ -160,7 +164,7 @@ def _doubts(file: Cube, references: SensorReferences) -> list[str]:
         ]
     if references.whites or file.is_srgb or file.meaning not in (Meaning.RAW, Meaning.FRACTION):
         return []
-    if file.meaning is Meaning.FRACTION and may_be_reflectance(file, bright_values([file])):
+    if file.meaning is Meaning.FRACTION and may_be_reflectance(file, bright_values([file], bands)):
         return []
     return [
         "the numbers are raw counts: spectra have the colour of the lamp and the sensor"
