@@ -503,7 +503,7 @@ def test_a_band_that_is_marked_as_bad_changes_nothing_but_itself(empty, tmp_path
     for index in range(VIEWS):
         values = cube(index).astype(np.float32)
         values[..., 2] = empty
-        entries = {"tint": 10 + 10 * (index % 2), "bbl": "{1, 1, 0, 1, 1, 1, 1}", "data_ignore_value": -9999}
+        entries: dict[str, Any] = {"tint": 10 + 10 * (index % 2), "bbl": "{1, 1, 0, 1, 1, 1, 1}", "data_ignore_value": -9999}
         write_envi(tmp_path / "capture" / f"view_{index}.hdr", values, **entries)
     write_transforms(tmp_path / "capture/transforms.json", [f"view_{index}" for index in range(VIEWS)])
     given = "cubes", "--data", tmp_path / "capture", "--poses", "transforms.json"
@@ -516,7 +516,7 @@ def test_a_no_data_value_that_no_file_names_is_said(dtype, tmp_path):
     for index in range(VIEWS):
         values = np.rint(cube(index) * 10000).astype(dtype)
         values[3:6] = -9999
-        entries = {"reflectance_scale_factor": 10000}
+        entries: dict[str, Any] = {"reflectance_scale_factor": 10000}
         write_envi(tmp_path / "capture" / f"view_{index}.hdr", values, **entries)
     write_transforms(tmp_path / "capture/transforms.json", [f"view_{index}" for index in range(VIEWS)])
     given = "cubes", "--data", tmp_path / "capture", "--poses", "transforms.json"
@@ -527,7 +527,7 @@ def test_a_no_data_value_that_no_file_names_is_said(dtype, tmp_path):
 
 def test_a_refusal_for_want_of_wavelengths_says_why_those_of_the_file_are_none(tmp_path):
     for index in range(VIEWS):
-        entries = {"wavelength_units": "Micrometers"}
+        entries: dict[str, Any] = {"wavelength_units": "Micrometers"}
         write_envi(tmp_path / "capture" / f"view_{index}.hdr", cube(index).astype(np.float32), **entries)
     write_transforms(tmp_path / "capture/transforms.json", [f"view_{index}" for index in range(VIEWS)])
     given = "cubes", "--data", tmp_path / "capture", "--poses", "transforms.json"
