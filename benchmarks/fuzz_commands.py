@@ -46,10 +46,10 @@ CHUNK = 20
 Command = tuple[Callable[[list[str]], object], Sequence[str]]
 """A command and its words, of which `IN` and `OUT` stand for folders."""
 RUN_COMMANDS: tuple[Command, ...] = (
-    (export, ("endmembers", "--run", "IN", "--output-dir", "OUT")),
-    (export, ("abundances", "--run", "IN", "--output-dir", "OUT")),
-    (evaluate, ("--run", "IN", "--output-dir", "OUT")),
-    (render, ("--run", "IN", "--output-dir", "OUT", "--view", "0")),
+    (export, ("endmembers", "--run", "IN", "--output", "OUT")),
+    (export, ("abundances", "--run", "IN", "--output", "OUT")),
+    (evaluate, ("--run", "IN")),
+    (render, ("--run", "IN", "--output", "OUT", "--view", "0")),
 )
 
 

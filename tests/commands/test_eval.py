@@ -15,6 +15,9 @@ import torch
 from tests.factories.commands import done, picture_size, refused
 from tests.factories.runs import small_run
 from unmix_plugin.commands.eval import evaluate
+from unmix_plugin.commands.export import export
+from unmix_plugin.commands.render import render
+from unmix_plugin.commands.view import view
 from unmix_plugin.engine.processes import ALONE
 from unmix_plugin.engine.runs.load_run import load_pipeline
 from unmix_plugin.products.evaluation import evaluate_scene
@@ -103,6 +106,21 @@ def test_without_run_the_newest_is_evaluated_and_named(run_copy, monkeypatch):
     assert (run_copy / "eval" / "metrics.json").is_file()
     assert not (older / "eval").exists()
     assert "no run with a checkpoint" in refused(evaluate, "--output-dir", older)
+
+
+@pytest.mark.parametrize("command", [evaluate, export, render, view])
+def test_a_folder_to_look_for_runs_is_refused_beside_a_run(command, tmp_path):
+    """Elsewhere the flag says where to write; here it would do nothing."""
+    word = ["endmembers"] if command is export else []
+    said = refused(command, *word, "--run", tmp_path, "--output-dir", tmp_path / "figures")
+    assert "a run is named" in said
+    assert "The folder to write to is --output" in said
+    assert not (tmp_path / "figures").exists()
+
+
+def test_a_folder_to_look_for_runs_is_refused_beside_runs_to_compare(tmp_path):
+    said = refused(evaluate, tmp_path / "a", tmp_path / "b", "--output-dir", tmp_path)
+    assert "a run is named" in said
 
 
 @pytest.mark.slow

@@ -59,7 +59,7 @@ def evaluate(argv: list[str]) -> None:
 
 
 def _evaluate(options: _EvalOptions, processes: Processes) -> None:
-    from unmix_plugin.commands.reporting import CommandConsole, chosen_run
+    from unmix_plugin.commands.reporting import CommandConsole, chosen_run, refuse_to_look
     from unmix_plugin.engine.runs.load_run import load_config
 
     console = CommandConsole(quiet=not processes.is_first)
@@ -68,6 +68,8 @@ def _evaluate(options: _EvalOptions, processes: Processes) -> None:
             raise ConfigError("name runs either with --run or without it")
         if len({run.resolve() for run in options.runs}) < len(options.runs):
             raise ConfigError("a run is named twice; a comparison needs different runs")
+        if len(options.runs) > 1:
+            refuse_to_look(options.output_dir)
         for run in options.runs:  # before minutes are spent on the first
             load_config(run)
     if len(options.runs) > 1:

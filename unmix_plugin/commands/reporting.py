@@ -17,6 +17,8 @@ from rich.segment import Segment
 
 from unmix_plugin.engine.printing import cleaned, tell
 from unmix_plugin.engine.runs.run_folder import newest_run
+from unmix_plugin.errors import ConfigError
+from unmix_plugin.products.product import RunOptions
 
 if TYPE_CHECKING:
     from unmix_plugin.engine.model import DataManager
@@ -36,13 +38,24 @@ def chosen_run(run: Path | None, output_dir: Path) -> Path:
     """The run folder named, or the newest under `output_dir`, which is then printed.
 
     Raises:
+        ConfigError: a run is named, and a folder to look for one, which would do nothing.
         RunError: none was named and there is none.
     """
     if run is not None:
+        refuse_to_look(output_dir)
         return run
     newest = newest_run(output_dir).path
     tell(f"newest run: {newest}")
     return newest
+
+
+def refuse_to_look(output_dir: Path) -> None:
+    """Refuse another folder than the usual one to look for the newest run, where runs are named. Raises ConfigError."""
+    if output_dir != RunOptions.output_dir:
+        raise ConfigError(
+            f"--output-dir {output_dir} is where the newest run is looked for, and a run is named: leave one of them "
+            "out. The folder to write to is --output, of commands that have it"
+        )
 
 
 def spectral_scene(datamanager: DataManager) -> Scene | None:

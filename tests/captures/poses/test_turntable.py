@@ -119,6 +119,22 @@ def test_angles_are_ranges_one_for_each_place_or_a_table(tmp_path):
 
 
 @pytest.mark.parametrize(
+    "text",
+    [
+        "view;angle\na;0,5\nb;450,0\n",
+        "sep=;\r\nView;Angle;Camera\r\na;0,5;1\r\nb;450;1\r\n",
+        "view\tangle\na.hdr\t0.5\nb.hdr\t450\n",
+        "turned on Monday\n\nview,angle\na,0.5\nb,450\n",
+    ],
+)
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
+def test_tables_of_angles_are_read_as_spreadsheets_write_them(tmp_path, text, encoding):
+    (tmp_path / "angles.csv").write_bytes(text.encode(encoding))
+    turns = parse_angles(str(tmp_path / "angles.csv"), ["a", "b"])
+    assert [turns[name].angle_deg for name in "ab"] == [0.5, 450.0]
+
+
+@pytest.mark.parametrize(
     ("text", "said"),
     [
         ("0:360:10", "gives 36 angles .* for 3 views"),
@@ -128,8 +144,8 @@ def test_angles_are_ranges_one_for_each_place_or_a_table(tmp_path):
         ("0:360:-90", "gives 0 angles"),
         ("view,angle\na,0\nb,10\n", "no angle for c"),
         ("view,angle\na,0\nb,10\nc,20\nd,30\n", "no view is called d"),
-        ("view,angle\na,zero\n", "line 2: expected the columns view and angle"),
-        ("name,turn\na,0\n", "line 2: expected the columns view and angle"),
+        ("view,angle\na,zero\n", "line 2: 'zero' is no angle"),
+        ("name,turn\na,0\n", "expected the columns view and angle"),
         ("view,angle\na,0\nb,10\na,20\n", "line 4: the view a has an angle already"),
     ],
 )

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float64, Int, UInt8
 
+from unmix_plugin.engine.tables import decode_text, named_rows
 from unmix_plugin.errors import ConfigError, name_some
 
 _MOST_MATCHED_DEG, _MOST_TOUCHED_DEG = 30.0, 130.0
@@ -81,25 +82,24 @@ def parse_angles(text: str, names: Sequence[str]) -> dict[str, Turn]:
 
 def _read_angles(path: Path, names: Sequence[str]) -> dict[str, Turn]:
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            rows = list(csv.DictReader(file))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        table = named_rows(decode_text(path.read_bytes()), ("view", "angle"))
+    except (OSError, csv.Error) as error:
         raise ConfigError(f"--angles {path}: it can't be read ({error}); give a CSV file") from error
+    expected = "expected the columns view and angle (degrees), and perhaps camera"
+    if table is None:
+        raise ConfigError(f"--angles {path}: no line names its columns; {expected}")
+    dialect, rows = table
     found: dict[str, Turn] = {}
     places: dict[str, int] = {}
-    for line, row in enumerate(rows, start=2):
-        try:
-            name, angle = (row["view"] or "").strip(), float(row["angle"])
-            if not np.isfinite(angle):
-                raise ValueError
-        except (KeyError, TypeError, ValueError) as error:
-            raise ConfigError(
-                f"--angles {path}, line {line}: expected the columns view and angle (degrees), and perhaps camera"
-            ) from error
+    for line, row in rows:
+        name, text = row["view"], row.get("angle", "")
+        angle = dialect.number(text)
+        if angle is None or not np.isfinite(angle):
+            raise ConfigError(f"--angles {path}, line {line}: {text!r} is no angle ({dialect}); {expected}")
         key = name if name in names else Path(name).stem
         if key in found:
             raise ConfigError(f"--angles {path}, line {line}: the view {key} has an angle already")
-        found[key] = Turn(angle, places.setdefault((row.get("camera") or "").strip(), len(places)))
+        found[key] = Turn(angle, places.setdefault(row.get("camera", ""), len(places)))
     missing, unknown = [n for n in names if n not in found], [n for n in found if n not in names]
     if missing or unknown:
         lacking = f"no angle for {name_some(missing)}; " if missing else ""
