@@ -503,7 +503,11 @@ def test_a_band_that_is_marked_as_bad_changes_nothing_but_itself(empty, tmp_path
     for index in range(VIEWS):
         values = cube(index).astype(np.float32)
         values[..., 2] = empty
-        entries: dict[str, Any] = {"tint": 10 + 10 * (index % 2), "bbl": "{1, 1, 0, 1, 1, 1, 1}", "data_ignore_value": -9999}
+        entries: dict[str, Any] = {
+            "tint": 10 + 10 * (index % 2),
+            "bbl": "{1, 1, 0, 1, 1, 1, 1}",
+            "data_ignore_value": -9999,
+        }
         write_envi(tmp_path / "capture" / f"view_{index}.hdr", values, **entries)
     write_transforms(tmp_path / "capture/transforms.json", [f"view_{index}" for index in range(VIEWS)])
     given = "cubes", "--data", tmp_path / "capture", "--poses", "transforms.json"
