@@ -125,7 +125,7 @@ def on_white(picture: np.ndarray, exposure: float) -> np.ndarray:
 
 def traced(scene: TrainedObject, camera: Cameras, light: HeldOutLight) -> np.ndarray:
     """The trained material in all bands, as `unmix-render` shows it."""
-    poses = scene.frame.poses_to_model(camera.camera_to_world.double().numpy())
+    poses = scene.frame.moved(camera.camera_to_world.double().numpy())
     lit = replace(scene, environment=light.environment)
     view = lit.look(replace(camera, camera_to_world=torch.from_numpy(poses).float()))
     return torch.cat([view["linear_rgb"], view["accumulation"][..., None]], dim=-1).numpy()
