@@ -94,6 +94,10 @@ class FittedSplats:
         """Some of them."""
         return FittedSplats(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
+    def to(self, device: torch.device) -> FittedSplats:
+        """The same on another device."""
+        return FittedSplats(*(getattr(self, field.name).to(device) for field in fields(self)))
+
     def picture(self, camera: Cameras, subpixels: int = 1, blur: float = _BLUR) -> Float[Tensor, "H W 4"]:
         """What a viewer shows through one pinhole camera: sRGB on black and opacity; with `subpixels` squared parts a
         pixel means over these, in linear light. Each Gaussian gets `blur` more variance, in square parts of a pixel."""
@@ -115,7 +119,7 @@ class FittedSplats:
         total, most = self.positions.new_zeros(len(self)), self.positions.new_zeros(len(self))
         for camera, picture in zip(cameras, pictures, strict=True):
             # A picture is linear in its colours, so its slope by a colour is the sum of what a Gaussian is seen by.
-            values = torch.cat([picture, torch.ones_like(picture[..., :1])], dim=-1)
+            values = torch.cat([picture, torch.ones_like(picture[..., :1])], dim=-1).to(sums.device)
             colours = self.positions.new_zeros(len(self), values.shape[-1]).requires_grad_()
             seen = torch.autograd.grad(self._blended(camera, colours), colours, values)[0]
             sums, total, most = sums + seen[:, :-1], total + seen[:, -1], torch.maximum(most, seen[:, -1])
@@ -125,6 +129,7 @@ class FittedSplats:
         self, camera: Cameras, colours: Float[Tensor, "P C"], blur: float = _BLUR
     ) -> Float[Tensor, "H W C"]:
         """Colours blended through one pinhole camera."""
+        camera = camera.to(self.positions.device)
         pose, focal, center = camera.camera_to_world[0], camera.focal_px[0], camera.center_px[0]
         turn = pose[:, :3] * pose.new_tensor([1.0, -1.0, -1.0])  # to x right, y down, z forward
         local = (self.positions - pose[:, 3]) @ turn
@@ -244,7 +249,8 @@ def fit_splats(
 ) -> FittedSplats:
     """Make Gaussians look like the field: Adam, one view a step, the squared difference of colours and opacity."""
     targets = _targets(scene, follow)
-    values = {field.name: getattr(start, field.name).clone().requires_grad_() for field in fields(start)}
+    on_device = start.to(scene.device)
+    values = {field.name: getattr(on_device, field.name).clone().requires_grad_() for field in fields(start)}
     rates = {**_RATES, "positions": _RATES["positions"] * scene.pixel_size}
     groups = [{"params": [values[name]], "lr": rate} for name, rate in rates.items()]
     optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15)
@@ -253,13 +259,14 @@ def fit_splats(
     order = torch.cat([torch.randperm(len(targets), generator=generator) for _ in range(rounds)])
     for step, index in enumerate(follow("fitting splats", order[:steps].tolist())):
         target, blur = targets[index], _BLURS[step % len(_BLURS)]
-        difference = FittedSplats(**values).picture(target.camera, target.subpixels, blur) - target.picture
-        loss = (target.counts * difference.square()).mean()
+        shown = FittedSplats(**values).picture(target.camera, target.subpixels, blur)
+        difference = shown - target.picture.to(shown.device)
+        loss = (target.counts.to(shown.device) * difference.square()).mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
         schedule.step()
-    return FittedSplats(**{name: value.detach() for name, value in values.items()})
+    return FittedSplats(**{name: value.detach().cpu() for name, value in values.items()})
 
 
 def seen_splats(
@@ -271,7 +278,8 @@ def seen_splats(
         scene.lit_head_on.look(camera, subpixels=1).coefficients.map(lambda packed: packed.detach().cpu())
         for camera in follow("finding what splats are made of", cameras)
     ]
-    means, most = splats.seen_means(cameras, [one.packed for one in looked])
+    found = splats.to(scene.device).seen_means(cameras, [one.packed for one in looked])
+    means, most = (values.cpu() for values in found)
     is_seen = (most > _LEAST_SEEN) & (means[:, 0] > OCCUPIED_ACCUMULATION)
     means = means[is_seen] / means[is_seen, :1]
     return splats.select(is_seen), replace(looked[0], packed=means)
