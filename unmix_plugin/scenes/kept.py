@@ -22,6 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from unmix_plugin.engine.runs.replacing import temporary_name
 from unmix_plugin.errors import SceneError
 
 _LIBRARIES = ("numpy", "scipy", "scikit-image", "torch")
@@ -64,7 +65,7 @@ def judged_once(kind: type[_Judged], given: Mapping[str, Any], judge: Callable[[
     packed = zlib.compress(msgspec.msgpack.encode(found, enc_hook=_values), level=1)
     with suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        staged = path.with_suffix(f".{os.getpid()}")
+        staged = temporary_name(path)
         staged.write_bytes(packed)
         staged.replace(path)
         by_use = sorted(path.parent.glob(f"*{_SUFFIX}"), key=lambda kept: kept.stat().st_mtime, reverse=True)
