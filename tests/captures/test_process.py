@@ -27,7 +27,7 @@ from tests.factories.files import present
 from unmix_plugin.captures import process as process_module
 from unmix_plugin.captures.cube import ReadOptions
 from unmix_plugin.captures.layouts.cubes import find_cubes
-from unmix_plugin.captures.wavelengths import parse_wavelengths
+from unmix_plugin.captures.wavelengths import parse_bands
 from unmix_plugin.captures.writing.view_files import FULL_SCALE, write_view
 from unmix_plugin.engine.runs.replacing import LIST_NAME
 from unmix_plugin.errors import CaptureError, ConfigError, RunError
@@ -429,9 +429,48 @@ def test_a_file_of_wavelengths_has_one_a_line_or_a_header(tmp_path: Path, text, 
     (tmp_path / "nm.csv").write_text(text)
     if isinstance(nm, str):
         with pytest.raises(ConfigError, match=nm):
-            parse_wavelengths(str(tmp_path / "nm.csv"))
+            parse_bands(str(tmp_path / "nm.csv"))
     else:
-        np.testing.assert_allclose(parse_wavelengths(str(tmp_path / "nm.csv")), nm)
+        assert parse_bands(str(tmp_path / "nm.csv")).wavelengths_nm == pytest.approx(nm)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("wavelength,fwhm\n450,5\n460,6\n", [5, 6]),
+        ("wavelength (um);FWHM (nm)\n0,45;5\n0,46;6\n", [5, 6]),
+        ("wavelength [um],band_width\n0.45,0.005\n0.46,0.006\n", [5, 6]),
+        ("band,wavelength,bandwidth_um\n1,450,0.005\n2,460,0.006\n", [5, 6]),
+        ("wavelength,fwhm\nnm,um\n450,0.005\n460,0.006\n", [5, 6]),
+        ("wavelength,fwhm\n450,0.005\n460,0.006\n", [5, 6]),
+        ("wavelength,450,460\nfwhm,5,6\n", [5, 6]),
+        ("wavelength,name\n450,blue\n460,cyan\n", None),
+        ("wavelength,fwhm\n450,5\n460,\n", "the width at 460 nm is nan"),
+        ("wavelength,fwhm\n450,0\n460,5\n", "the width at 450 nm is 0"),
+        ("wavelength,fwhm\n450,5000\n460,5000\n", "widths of bands 5000 to 5000 nm"),
+        ("wavelength,fwhm (px)\n450,2\n460,2\n", "widths of bands in 'px'"),
+        ("wavelength,fwhm,bandwidth\n450,5,7\n460,5,7\n", "the columns 'fwhm' and 'bandwidth'"),
+        ("wavelength,bbl\n450,1\n460,2\n", "marks of good bands"),
+    ],
+)
+def test_widths_beside_wavelengths_are_those_of_the_bands_or_refused(tmp_path: Path, text, expected):
+    (tmp_path / "nm.csv").write_text(text)
+    if isinstance(expected, str):
+        with pytest.raises(ConfigError, match=expected):
+            parse_bands(str(tmp_path / "nm.csv"))
+        return
+    found = parse_bands(str(tmp_path / "nm.csv"))
+    assert found.wavelengths_nm == pytest.approx([450, 460])
+    assert found.fwhm_nm == (None if expected is None else pytest.approx(expected))
+
+
+def test_given_widths_and_marks_of_bad_bands_come_into_the_scene(tmp_path: Path):
+    capture = make_capture(tmp_path / "capture", kind="npy")
+    rows = [f"{nm},{nm / 50},{int(band != 3)}" for band, nm in enumerate(WAVELENGTHS_NM)]
+    (tmp_path / "nm.csv").write_text("\n".join(["wavelength,fwhm,bbl", *rows]))
+    scene, _ = made(tmp_path, capture, **references_of(capture, "npy"), wavelengths=str(tmp_path / "nm.csv"))
+    np.testing.assert_array_equal(scene.wavelengths_nm, np.delete(WAVELENGTHS_NM, 3))
+    assert scene.fwhm_nm == pytest.approx(np.delete(WAVELENGTHS_NM, 3) / 50)
 
 
 NAMES = ["view_00", "view_01", "view_02", "view_03"]

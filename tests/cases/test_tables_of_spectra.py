@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tests.factories.forms import braced, spectra
-from unmix_plugin.captures.wavelengths import parse_wavelengths
+from unmix_plugin.captures.wavelengths import parse_bands
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.formats.libraries import library_of, read_library
 from unmix_plugin.spectral.library.spectra_csv import read_spectra
@@ -142,7 +142,7 @@ def test_one_reader_serves_lamps_sensors_panels_and_lists_of_wavelengths(tmp_pat
     for kind, (text, encoding) in READ.items():
         if kind != "lines of words before the head":
             (tmp_path / "table.csv").write_bytes(text.encode(encoding))
-            np.testing.assert_allclose(parse_wavelengths(str(tmp_path / "table.csv")), NM)
+            assert parse_bands(str(tmp_path / "table.csv")).wavelengths_nm == pytest.approx(NM)
         (tmp_path / "table.csv").write_bytes(text.encode(encoding))
         sensor, table_ = read_sensor(tmp_path / "table.csv"), read_spectra(tmp_path / "table.csv")
         np.testing.assert_allclose(table_.spectra, SPECTRA, atol=1e-6)

@@ -14,7 +14,7 @@ from PIL import Image
 from tests.factories.scenes import look_at
 from tests.fuzz.mutation import Reader, mutate_json, mutate_png
 from unmix_plugin.captures.poses.turntable_observations import parse_angles
-from unmix_plugin.captures.wavelengths import parse_wavelengths
+from unmix_plugin.captures.wavelengths import parse_bands
 from unmix_plugin.errors import ConfigError, SceneError, SpectrumError
 from unmix_plugin.formats.libraries import read_library
 from unmix_plugin.scenes.reading.cubes import UnreadableArrayError, measure_cube, read_array_header
@@ -182,7 +182,7 @@ def library_text_reader() -> Reader:
 
 def wavelengths_reader() -> Reader:
     samples = (b"wavelength,width\n450,5\n520.5,5\n", b"450\n520\n600\n", b"450.5,520,600\n")
-    return Reader(samples, "bands.csv", lambda path: parse_wavelengths(str(path)), (ConfigError,))
+    return Reader(samples, "bands.csv", lambda path: parse_bands(str(path)), (ConfigError,))
 
 
 def angles_reader() -> Reader:

@@ -18,7 +18,7 @@ import numpy as np
 from unmix_plugin.captures.cube import BandTable
 from unmix_plugin.captures.fields import PARTS, listed, plain_names
 from unmix_plugin.captures.report import Code, Remark
-from unmix_plugin.captures.wavelengths import PLAUSIBLE_NM, wavelengths_in_names
+from unmix_plugin.captures.wavelengths import PLAUSIBLE_NM, nm_per_width, wavelengths_in_names
 from unmix_plugin.spectral.bands import are_band_numbers, nm_per_unit
 
 _CENTRES = re.compile(
@@ -28,8 +28,6 @@ _CENTRES = re.compile(
 _WIDTHS = re.compile(r"(fwhms?|band_?widths?|list_fwhm_[^_]*)(_?(nm|um))?")
 GOOD = re.compile(r"bbl|good_(wavelengths?|bands?)|list_cw_.*_flags")
 NAMES = re.compile(r"band_?names?")
-_LEAST_WIDTH_NM = 0.05
-"""Widths below this are in another unit, as are those wider than their wavelengths."""
 _UNUSABLE = "the file gives no wavelengths that can be used, see the notes"
 
 
@@ -165,17 +163,16 @@ def _widths_nm(
 ) -> np.ndarray | None:
     """Widths by their own unit, otherwise by that of the wavelengths, of which one is `factor` nm, or by nm or
     micrometres where that can't be; None with a warning where nothing fits."""
-    tried = (factor, 1.0, 1e3) if unit.lower() in ("", "unknown") else (nm_per_unit(unit) or np.nan,)
-    fitting = [one for one in tried if ((widths * one <= centres) & (widths * one >= _LEAST_WIDTH_NM)).all()]
+    stated, fitting = nm_per_width(widths, unit, factor, centres)
     low, high = widths.min(), widths.max()
-    if not fitting:
-        shown = f"{low * tried[0]:g} to {high * tried[0]:g} nm" if tried[0] > 0 else f"in {unit!r}"
+    if fitting is None:
+        shown = f"in {unit!r}" if stated is None else f"{low * stated:g} to {high * stated:g} nm"
         remarks.append(Remark.of(Code.WIDTHS_IMPOSSIBLE, range=shown))
         return None
-    if fitting[0] != tried[0]:
-        taken = "nm" if fitting[0] == 1.0 else "micrometres"
+    if fitting != stated:
+        taken = "nm" if fitting == 1.0 else "micrometres"
         remarks.append(Remark.of(Code.WIDTHS_IN_OTHER_UNIT, low=f"{low:g}", high=f"{high:g}", unit=taken))
-    return widths * fitting[0]
+    return widths * fitting
 
 
 def _fitting(

@@ -38,8 +38,8 @@ class ReadOptions:
 
     dataset: str | None = None
     """Variable or data set to take from a file that holds several."""
-    wavelengths_nm: Float64[np.ndarray, " B"] | None = None
-    """Band centres in nm, in the order of the file."""
+    bands: BandTable | None = None
+    """Centres of the bands, and widths and marks where the user has them, in the order of the file."""
     axes: Axes | None = None
     """Order of the axes in formats that don't fix it: NumPy, MATLAB, HDF5, pages of a TIFF."""
     size: tuple[int, int] | None = None
@@ -48,6 +48,11 @@ class ReadOptions:
     """Rows and columns of filters in images of one band, of which each pixel of a block is a band."""
     exclude: tuple[Path, ...] = ()
     """Files in a folder that are not views, such as dark and white references."""
+
+    @property
+    def wavelengths_nm(self) -> Float64[np.ndarray, " B"] | None:
+        """Band centres in nm that the user gives."""
+        return None if self.bands is None else self.bands.wavelengths_nm
 
 
 @dataclass(frozen=True)
@@ -66,6 +71,19 @@ class BandTable:
     """What the file calls its bands."""
     is_given: bool = False
     """Whether the user gives the wavelengths, which files do not state, or state wrongly."""
+
+    @property
+    def num_known(self) -> int:
+        """How many wavelengths it has."""
+        return 0 if self.wavelengths_nm is None else len(self.wavelengths_nm)
+
+    def __getitem__(self, index: slice) -> BandTable:
+        """Some of the bands."""
+        centres, widths, bad, names = (
+            None if of_bands is None else of_bands[index]
+            for of_bands in (self.wavelengths_nm, self.fwhm_nm, self.bad, self.names)
+        )
+        return replace(self, wavelengths_nm=centres, fwhm_nm=widths, bad=bad, names=names)
 
     def marking(self, *bad: Bool[np.ndarray, " B"] | None) -> BandTable:
         """The table in which these bands are bad too, where there are such marks."""

@@ -82,8 +82,8 @@ class ProcessOptions:
     for each place of the camera, with commas between; or a CSV file with the columns view, angle and, if there were
     several places, camera."""
     wavelengths: str | None = None
-    """Band centres in nm for files that don't name them: a CSV file with a column `wavelength`, or a list such as
-    620,555,503."""
+    """Band centres in nm for files that don't name them: a CSV file with a column `wavelength` (`fwhm` beside has
+    the widths, `bbl` 0 for bad bands), or a list such as 620,555,503."""
     dataset: str | None = None
     """Data set to take from HDF5, NetCDF and MATLAB files that hold several."""
     axes: Axes | None = None

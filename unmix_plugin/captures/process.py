@@ -29,7 +29,7 @@ from unmix_plugin.captures.posing import PosedViews, asked_distance, given_poses
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.report import Code, Kind, Remark, sentences
 from unmix_plugin.captures.spoilt import UnreadableViews, judge_sharpness
-from unmix_plugin.captures.wavelengths import parse_wavelengths
+from unmix_plugin.captures.wavelengths import parse_bands
 from unmix_plugin.captures.writing.resampling import Resampling
 from unmix_plugin.captures.writing.scene_files import write_scene_files
 from unmix_plugin.captures.writing.view_files import ViewRecord, write_view
@@ -198,11 +198,11 @@ def _open_capture(options: ProcessOptions) -> tuple[GivenReferences, Capture]:
             asked = ReadOptions(options.dataset, None, options.axes, mosaic=mosaic)
             opened[kind] = open_spectral_file(path, asked)
     references = GivenReferences(**opened)
-    wavelengths = None if options.wavelengths is None else parse_wavelengths(options.wavelengths)
+    bands = None if options.wavelengths is None else parse_bands(options.wavelengths)
     named = tuple(path for file in references.files for path in file.files)
     if options.poses is not None:  # an array, perhaps
         named += (Path(options.poses), options.data / options.poses)
-    asked = ReadOptions(options.dataset, wavelengths, options.axes, mosaic=mosaic, exclude=named)
+    asked = ReadOptions(options.dataset, bands, options.axes, mosaic=mosaic, exclude=named)
     capture = find_views(options.layout, options.data, asked)
 
     # Views of one camera in several sizes, upright and across, are views of several sensors.

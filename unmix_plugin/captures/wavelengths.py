@@ -12,10 +12,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float64
 
+from unmix_plugin.captures.cube import BandTable
 from unmix_plugin.captures.names import common_length
 from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.spectral.bands import nm_per_unit, require_nanometres
-from unmix_plugin.spectral.library.spectral_tables import read_wavelengths
+from unmix_plugin.spectral.library.spectral_tables import ListedBands, read_bands
 
 _DIGITS = r"\d+(?:[.,]\d+)?"
 _UNIT = r"(?:nm|nanomet(?:er|re)s?|[uµμ]m|micromet(?:er|re)s?|microns?)(?![a-z])"
@@ -38,6 +39,8 @@ _COUNTER = re.compile(r"(?:bands?|b|ch|channel|frame|img|image|view|page|dsc|#)[
 """What precedes a number that counts instead of measuring."""
 _OTHER_UNIT = re.compile(r" ?(?:cm|[muµμ]m|microns?|[muµμ]s|[kmgt]?hz)(?![a-z])", re.I)
 """What follows a wavenumber, a length, a time or a frequency, which are no wavelengths in nm; 0.45um is read before."""
+_LEAST_WIDTH_NM = 0.05
+"""Widths below this are in another unit, as are those wider than their wavelengths."""
 _USUAL_NM = (200.0, 3000.0)
 """What a number without a unit must lie in to be taken for nm."""
 PLAUSIBLE_NM = (100.0, 30_000.0)
@@ -132,30 +135,86 @@ def _nm(text: str, unit: str) -> float | None:
     return next((nm for nm in values if PLAUSIBLE_NM[0] <= nm <= PLAUSIBLE_NM[1]), None)
 
 
-def parse_wavelengths(text: str) -> Float64[np.ndarray, " B"]:
-    """Band centres in nm from a list `620,555,503`, or from a text file: its column of wavelengths, one number a line,
-    or one line of numbers. Raises ConfigError: no such file, no numbers, or numbers that are not wavelengths in nm."""
+def nm_per_width(
+    widths: Float64[np.ndarray, " B"],
+    unit: str,
+    nm_per_wavelength: float,
+    centres_nm: Float64[np.ndarray, " B"],
+) -> tuple[float | None, float | None]:
+    """What a number of a list of widths is in nm.
+
+    Args:
+        unit: That of the list; empty or `unknown` where it has none.
+        nm_per_wavelength: Unit of the wavelengths beside it, which a list without a unit is in, too; or else in nm or
+            micrometres, where it can't be in that one.
+    Returns:
+        By what is stated, None for what is no unit; and what fits, None where nothing does.
+    """
+    is_stated = unit.lower() not in ("", "unknown")
+    stated = nm_per_unit(unit) if is_stated else nm_per_wavelength
+    tried = [stated] if is_stated else [stated, 1.0, 1e3]
+
+    def fits(factor: float | None) -> bool:
+        nm = widths * (factor or np.nan)
+        return bool(((nm >= _LEAST_WIDTH_NM) & (nm <= centres_nm)).all())
+
+    return stated, next(filter(fits, tried), None)
+
+
+def parse_bands(text: str) -> BandTable:
+    """Bands from a list of their centres in nm, `620,555,503`, or from a text file: its column of wavelengths with
+    those of widths (`fwhm`) and marks of good bands (`bbl`) beside, one number a line, or one line of numbers.
+
+    Raises:
+        ConfigError: no such file, no numbers, numbers that are not wavelengths in nm, or widths and marks that are none
+            of their bands.
+    """
     what = f"--wavelengths {text}"
     try:
-        values = np.array([float(word) for word in text.split(",")])
+        listed = ListedBands(np.array([float(word) for word in text.split(",")]), nm_per_number=1.0)
     except ValueError:
         if not Path(text).exists():
             raise ConfigError(
                 f"{what}: neither a list of numbers, such as 620,555,503, nor a CSV file or another table that is there"
             ) from None
         try:
-            values = read_wavelengths(Path(text))
+            listed = read_bands(Path(text))
         except SpectrumError as error:
             raise ConfigError(
                 f"{what}: {error}; expected numbers in nm, such as 620,555,503, or a table with a column 'wavelength'"
             ) from error
-    if not np.isfinite(values).all():
+    centres_nm, widths, is_good = listed.centers_nm, listed.widths, listed.is_good
+    if not np.isfinite(centres_nm).all():
         raise ConfigError(f"{what} holds NaN or infinity; expected band centres in nm")
     try:
-        require_nanometres(values)
+        require_nanometres(centres_nm)
     except SpectrumError as error:
         raise ConfigError(f"{what}: {error}") from error
-    return values
+    source, advice = "given with --wavelengths", "correct the column, or take it out"
+    if widths is not None:
+        if not (np.isfinite(widths) & (widths > 0)).all():
+            band = int(np.argmin(np.isfinite(widths) & (widths > 0)))
+            raise ConfigError(
+                f"{what}: the width at {centres_nm[band]:g} nm is {widths[band]:g}; expected the full width at half "
+                f"maximum of each band, above 0: {advice}"
+            )
+        unit = listed.width_unit
+        stated, factor = nm_per_width(widths, unit, listed.nm_per_number, centres_nm)
+        if factor is None:
+            found = (
+                f"in {unit!r}"
+                if stated is None
+                else f"{widths.min() * stated:g} to {widths.max() * stated:g} nm"
+            )
+            raise ConfigError(
+                f"{what}: widths of bands {found}; expected them in nm or micrometres, narrower than their "
+                f"wavelengths: {advice}"
+            )
+        source += "" if factor == stated else f", widths taken as {'nm' if factor == 1.0 else 'micrometres'}"
+        widths = widths * factor
+    if is_good is not None and not np.isin(is_good, (0.0, 1.0)).all():
+        raise ConfigError(f"{what}: marks of good bands must be 1, and 0 for bad ones: {advice}")
+    return BandTable(centres_nm, source, widths, None if is_good is None else is_good == 0, is_given=True)
 
 
 def in_ranges(text: str, wavelengths_nm: Float64[np.ndarray, " B"]) -> Bool[np.ndarray, " B"]:

@@ -17,7 +17,7 @@ from tests.factories.data_sets import (
     write_real,
 )
 from tests.factories.files import check_file, present, rows_and_bands_of
-from unmix_plugin.captures.cube import ReadOptions
+from unmix_plugin.captures.cube import BandTable, ReadOptions
 from unmix_plugin.captures.layouts.transforms import (
     find_nespof,
     find_nespof_real,
@@ -50,7 +50,7 @@ def test_views_have_the_first_stokes_component_of_all_wavelengths_opacity_poses_
         assert camera.lens.focal_px[0] == pytest.approx(0.5 * 7 / np.tan(0.4))
     rows_and_bands_of(scene.views[2].cube, scene.views[2].cube.read())
     write_nespof(tmp_path)
-    given = ReadOptions(wavelengths_nm=np.array([500.0, 510.0, 520.0]))
+    given = ReadOptions(bands=BandTable(np.array([500.0, 510.0, 520.0])))
     check_file(find_nespof(tmp_path, given).views[0].cube, nm=[500, 510, 520])
 
 

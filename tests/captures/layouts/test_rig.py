@@ -27,7 +27,7 @@ from tests.factories.rig_flight import (
     write_poses,
 )
 from tests.factories.rig_flight import tags as tags_of
-from unmix_plugin.captures.cube import CameraTags, Cube, ReadOptions
+from unmix_plugin.captures.cube import BandTable, CameraTags, Cube, ReadOptions
 from unmix_plugin.captures.layouts.rig import find_rig, lens_of, split_shots
 from unmix_plugin.captures.names import natural_order
 from unmix_plugin.captures.poses.lens import Lens
@@ -219,10 +219,12 @@ def test_thermal_bands_and_missing_bands_are_said(tmp_path):
 def test_given_wavelengths_are_one_a_lens(tmp_path):
     for band in (1, 2):
         write_band_file(tmp_path / f"IMG_0000_{band}.tif", np.full((4, 5), 9), {})
-    views = find_rig(tmp_path, ReadOptions(wavelengths_nm=np.array([500.0, 600.0]))).views
+    given = BandTable(np.array([500.0, 600.0]), fwhm_nm=np.array([10.0, 20.0]))
+    views = find_rig(tmp_path, ReadOptions(bands=given)).views
     assert [view.cube.bands.wavelengths_nm for view in views] == [500.0, 600.0]
+    assert [view.cube.bands.fwhm_nm for view in views] == [10.0, 20.0]
     with pytest.raises(CaptureError, match=r"gives 3 numbers for 2 lenses \(1, 2\)"):
-        find_rig(tmp_path, ReadOptions(wavelengths_nm=np.array([500.0, 600.0, 700.0])))
+        find_rig(tmp_path, ReadOptions(bands=BandTable(np.array([500.0, 600.0, 700.0]))))
 
 
 @pytest.mark.parametrize(

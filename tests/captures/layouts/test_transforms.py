@@ -25,7 +25,7 @@ from tests.factories.data_sets import (
     write_unmix,
 )
 from tests.factories.files import check_file, present, warnings_of, write_envi
-from unmix_plugin.captures.cube import ReadOptions
+from unmix_plugin.captures.cube import BandTable, ReadOptions
 from unmix_plugin.captures.layouts.transforms import find_nerfstudio, find_unmix_nerf
 from unmix_plugin.captures.options import LAYOUTS, find_views
 from unmix_plugin.errors import CaptureError, ConfigError
@@ -59,7 +59,7 @@ def test_cubes_pictures_labels_and_poses_are_found_where_the_converter_left_them
         assert present(camera.lens).focal_px == (9.0, 9.0)
     told = any("2 paths name a folder 'val' whose files lie in 'eval'" in note for note in capture.notes)
     assert told == (written == "eval")
-    given = ReadOptions(wavelengths_nm=np.array([400.0, 410.0, 420.0, 430.0]))
+    given = ReadOptions(bands=BandTable(np.array([400.0, 410.0, 420.0, 430.0])))
     check_file(find_unmix_nerf(tmp_path, given).views[0].cube, nm=[400, 410, 420, 430])
 
 

@@ -20,7 +20,7 @@ from tests.factories.files import (
     warnings_of,
 )
 from unmix_plugin.captures.calibration.references import find_missing, finished_by, stated_reflectance
-from unmix_plugin.captures.cube import ReadOptions
+from unmix_plugin.captures.cube import BandTable, ReadOptions
 from unmix_plugin.captures.readers import containers
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.errors import CaptureError
@@ -355,10 +355,10 @@ def test_the_order_of_axes_can_be_said(tmp_path):
     np.save(path, CUBE.transpose(2, 0, 1))
     check_file(open_spectral_file(path), warning="axis 0 is the shortest")
     check_file(open_spectral_file(path, ReadOptions(axes="byx")), values=CUBE)
-    given = open_spectral_file(path, ReadOptions(wavelengths_nm=NM))
-    check_file(given, values=CUBE, evidence="given by the user")
+    given = open_spectral_file(path, ReadOptions(bands=BandTable(NM, "the test")))
+    check_file(given, values=CUBE, evidence="the test")
     with pytest.raises(CaptureError, match="3 wavelengths were given for 5 rows x 8 columns x 9 bands"):
-        open_spectral_file(path, ReadOptions(wavelengths_nm=NM[:3]))
+        open_spectral_file(path, ReadOptions(bands=BandTable(NM[:3])))
 
 
 @pytest.mark.parametrize("kind", ["npy", "npz"])

@@ -142,7 +142,7 @@ def _open_views(
     pictures, views = {path.with_name(_stem(path)): path for path in shown}, []
     unreadable = UnreadableViews(len(paths))
     for name, path, of_view in zip(names, paths, references, strict=True):
-        plain = replace(options, wavelengths_nm=None)
+        plain = replace(options, bands=None)
         with unreadable.noted(name):
             opened = {kind: open_spectral_file(reference, plain) for kind, reference in of_view.items()}
             cubes = [open_spectral_file(part, options) for part in (joined or {}).get(path, [path])]

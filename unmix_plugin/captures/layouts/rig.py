@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from unmix_plugin.captures.camera_tags import XmpTags, exif_number, tag_numbers, tag_text
-from unmix_plugin.captures.cube import BandTable, Capture, CaptureView, Cube, ReadOptions
+from unmix_plugin.captures.cube import Capture, CaptureView, Cube, ReadOptions
 from unmix_plugin.captures.layouts.transforms import Split
 from unmix_plugin.captures.names import natural_order, view_names
 from unmix_plugin.captures.poses.lens import Lens, Points, fit_lens, require_possible
@@ -92,13 +92,14 @@ def find_rig(root: Path, options: ReadOptions) -> Capture:
         views.append(CaptureView(name, item.file, sensor, lens=lens, shot=shot, split=splits[shot]))
     _check_lenses(views)
     notes += [f"lens {sensor}: {why} ({counted(n, 'file')})" for (sensor, why), n in missing.items()]
-    if (given := options.wavelengths_nm) is not None:  # of a user, one a lens in the order of their names
+    if (given := options.bands) is not None:  # of a user, one a lens in the order of their names
         lenses = sorted({view.sensor for view in views})
-        if len(given) != len(lenses):
+        if given.num_known != len(lenses):
             named = f"{len(lenses)} lenses ({', '.join(lenses)})"
-            raise CaptureError(f"--wavelengths gives {len(given)} numbers for {named}; expected one a lens")
-        source = "given with --wavelengths"
-        tables = {one: BandTable(np.array([nm]), source) for one, nm in zip(lenses, given, strict=True)}
+            raise CaptureError(
+                f"--wavelengths gives {given.num_known} numbers for {named}; expected one a lens"
+            )
+        tables = {lens: given[index : index + 1] for index, lens in enumerate(lenses)}
         views = [replace(view, cube=replace(view.cube, bands=tables[view.sensor])) for view in views]
     ordered = sorted(views, key=lambda view: natural_order(view.name))
     return Capture("rig", root, tuple(ordered), notes=tuple(notes))

@@ -423,13 +423,13 @@ def _wavelength_entries(folder: Path, *, is_file: bool) -> dict[float, Path]:
 def _stack_intensities(files: dict[float, Path], options: ReadOptions) -> Cube:
     """Files of one view by their wavelength, as one cube."""
     parts = [open_intensity(file) for file in files.values()]
-    stack, given = stack_bands(parts, parts[0].path), options.wavelengths_nm
+    stack, given = stack_bands(parts, parts[0].path), options.bands
     if given is None:
         bands = BandTable(np.array(list(files), dtype=np.float64), "names of the folders or files, nm")
-    elif len(given) == len(files):
-        bands = BandTable(given, "given with --wavelengths")
+    elif given.num_known == len(files):
+        bands = given
     else:
-        numbers = f"--wavelengths gives {len(given)} numbers"
+        numbers = f"--wavelengths gives {given.num_known} numbers"
         raise CaptureError(f"{stack.path} has {len(files)} bands, {numbers}; expected one a band")
     return replace(stack, bands=bands)
 

@@ -110,15 +110,16 @@ def open_spectral_file(path: Path, options: ReadOptions | None = None) -> Cube:
             if opened.reader not in readers and getattr(options, name) is not None
         ]
         opened = opened.remarking(*unused)
-        given = options.wavelengths_nm
+        given = options.bands
         if given is None:
             return opened
-        if len(given) != num_bands:
+        if given.num_known != num_bands:
             raise CaptureError(
-                f"{opened.path}: {len(given)} wavelengths were given for {size}{said_of_mosaic(opened)}"
+                f"{opened.path}: {given.num_known} wavelengths were given for {size}{said_of_mosaic(opened)}"
             )
-        bands = replace(opened.bands, wavelengths_nm=given, source="given by the user", is_given=True)
-        return replace(opened, bands=bands)
+        known = opened.bands if given.fwhm_nm is None else replace(opened.bands, fwhm_nm=given.fwhm_nm)
+        known = replace(known, wavelengths_nm=given.wavelengths_nm, source=given.source, is_given=True)
+        return replace(opened, bands=known.marking(given.bad))
     except CaptureError:
         raise
     except Exception as error:

@@ -62,6 +62,16 @@ class NumberTable:
                 return factor
         return None
 
+    def columns_of(self, word: re.Pattern[str]) -> dict[int, str]:
+        """Columns that a word heads, with what follows it there or stands below it: a unit, or nothing."""
+        found = {}
+        for index, cell in enumerate(self.head or ()):
+            text = _plain(cell)
+            if index != self.wavelength_column and (match := word.match(text)) is not None:
+                below = "" if self.units is None else self.units[index].strip("[]() ")
+                found[index] = below or _rest(text, match)
+        return found
+
     def is_percent(self, column: int) -> bool:
         """Whether the line of units says so."""
         return self.units is not None and _PERCENT_UNIT.fullmatch(self.units[column]) is not None

@@ -46,10 +46,14 @@ _DEVIATION = re.compile(
     re.IGNORECASE,
 )
 _NO_SPECTRUM = re.compile(
-    r"(?:#|no\.?|nr\.?|index|bands?(?: (?:no\.?|nr\.?|number))?|chan(?:nel)?s?\.?\s?#?|fwhm.*|band ?widths?.*)",
+    r"(?:#|no\.?|nr\.?|index|bands?(?: (?:no\.?|nr\.?|number))?|chan(?:nel)?s?\.?\s?#?|fwhm.*|band[ _-]?widths?.*)",
     re.IGNORECASE,
 )
 """Heads of columns that count, or tell widths."""
+_WIDTHS = re.compile(
+    r"fwhm|full width(?: at)? half max(?:imum)?|band[ -]?widths?|widths?(?=\W*(?:[nuµμ]m\b|$))"
+)
+_GOOD_BANDS = re.compile(r"(?:bbl|good(?: (?:wavelengths?|bands?))?)$")
 _REFLECTANCE = re.compile(r"refl|tgt\.?/ref", re.IGNORECASE)
 _RAW = re.compile(r"\b(?:rad|radiance|irrad|irradiance|dn|counts?|reference|target)\b", re.IGNORECASE)
 """Heads of columns from which an instrument computed the reflectance beside them."""
@@ -77,6 +81,21 @@ class MeasuredSpectra:
     """In any order."""
     values: Float64[np.ndarray, "K R"]
     """NaN where nothing was measured."""
+
+
+@dataclass(frozen=True, eq=False)
+class ListedBands:
+    """The bands of a sensor as a text file lists them."""
+
+    centers_nm: Float64[np.ndarray, " B"]
+    nm_per_number: float
+    """What a number of the file is in nm."""
+    widths: Float64[np.ndarray, " B"] | None = None
+    """Full width at half maximum, in the unit of the file; NaN where there is none."""
+    width_unit: str = ""
+    """As the file has it; empty where it has none."""
+    is_good: Float64[np.ndarray, " B"] | None = None
+    """0 for a bad band, NaN where nothing is said."""
 
 
 def without_markers(
@@ -128,11 +147,13 @@ def read_spectral_text(path: Path) -> MeasuredSpectra:
     return MeasuredSpectra(tuple(names), nm, without_markers(values[:, columns].T, scale))
 
 
-def read_wavelengths(path: Path) -> Float64[np.ndarray, " B"]:
-    """Wavelengths in nm of a text file: its column of them, whatever stands beside; or one a line; or one line of them.
+def read_bands(path: Path) -> ListedBands:
+    """Bands of a text file: its column of wavelengths, those of widths (`fwhm`) and of marks (`bbl`) if there are such,
+    whatever else stands beside; or a wavelength a line; or one line of them.
 
     Raises:
-        SpectrumError: it can't be read or holds none; the message does not name the file.
+        SpectrumError: it can't be read, holds no wavelengths, or several columns of widths; the message does not name
+            the file.
     """
     lines, delimiter = read_lines(path)
     table = table_in(path, lines, delimiter, fewest_columns=1, are_others_words=True)
@@ -145,7 +166,23 @@ def read_wavelengths(path: Path) -> Float64[np.ndarray, " B"]:
     numbers = (
         table.values[0] if table.head is None and rows == 1 else table.values[:, table.wavelength_column]
     )
-    return numbers * _nm_per_number(table, {})
+    factor, widths, marks = (
+        _nm_per_number(table, {}),
+        table.columns_of(_WIDTHS),
+        table.columns_of(_GOOD_BANDS),
+    )
+    for of_kind in (widths, marks):
+        if len(of_kind) > 1:
+            named = " and ".join(f"'{table.head[column]}'" for column in of_kind if table.head)
+            raise SpectrumError(f"the columns {named} say the same of each band; leave one of them")
+    width, unit = next(iter(widths.items()), (None, ""))
+    return ListedBands(
+        numbers * factor,
+        factor,
+        widths=None if width is None else table.values[:, width],
+        width_unit=unit,
+        is_good=next((table.values[:, column] for column in marks), None),
+    )
 
 
 def _named_columns(path: Path, head: Sequence[str], wavelengths: int) -> tuple[list[int], list[str]]:
