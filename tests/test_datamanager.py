@@ -325,3 +325,13 @@ def test_light_without_alpha_is_judged_by_the_pixels_that_masks_leave(tmp_path, 
     monkeypatch.setattr(judged_views, "find_matched_points", lambda views: asked.append(views.valid(0)))
     assert make(folder.root).initial_data()["light"] == "fixed"
     assert np.array_equal(asked[0], np.tri(height, width) > 0)
+
+
+def test_a_cube_that_two_views_share_is_named(scene_folder, tmp_path):
+    folder = tmp_path / "copied"
+    shutil.copytree(scene_folder, folder)
+    cubes = sorted(folder.rglob("*.npy"), key=lambda path: path.name)
+    first, second = [path for path in cubes if path.parent == cubes[0].parent][:2]
+    shutil.copy(first, second)
+    (warning,) = [text for text in make(folder).warnings() if "very same values" in text]
+    assert f"under different poses: {first.stem} = {second.stem}. " in warning

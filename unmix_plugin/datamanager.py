@@ -26,6 +26,7 @@ from unmix_plugin.presets import fill_auto, preset_for
 from unmix_plugin.scenes.doctor import (
     Finding,
     check_bands,
+    check_copies,
     check_lenses,
     check_masks,
     check_parallax,
@@ -262,6 +263,9 @@ class HyperspectralDataManager(DataManager):
             check_lenses(self.train_cameras),
         )
         yield from (finding for finding in checks if finding is not None)
+        scene, hashes = self.scene, self.scene.cube_hashes
+        poses = scene.cameras.camera_to_world.cpu().numpy()
+        yield from check_copies([frame.name for frame in scene.frames], hashes, poses)
         yield from check_bands(self.scene, self._noise, self._pixels.bad_share)
         if self.scene.has_backdrop:
             yield Finding.of(Message.PLAIN_BACKDROP)

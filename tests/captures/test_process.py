@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 from contextlib import suppress
 from pathlib import Path
 
@@ -471,6 +472,21 @@ def test_given_widths_and_marks_of_bad_bands_come_into_the_scene(tmp_path: Path)
     scene, _ = made(tmp_path, capture, **references_of(capture, "npy"), wavelengths=str(tmp_path / "nm.csv"))
     np.testing.assert_array_equal(scene.wavelengths_nm, np.delete(WAVELENGTHS_NM, 3))
     assert scene.fwhm_nm == pytest.approx(np.delete(WAVELENGTHS_NM, 3) / 50)
+
+
+def test_copies_of_a_view_are_named_with_whether_their_poses_differ(tmp_path: Path):
+    capture = make_capture(tmp_path / "capture", views=6)
+    for copy, source in (("view_01", "view_00"), ("view_04", "view_03")):
+        shutil.copy(capture.root / f"{source}.raw", capture.root / f"{copy}.raw")
+    path = capture.root / "transforms.json"
+    listed = json.loads(path.read_text())
+    listed["frames"][4]["transform_matrix"] = listed["frames"][3]["transform_matrix"]
+    path.write_text(json.dumps(listed))
+    _, findings = made(tmp_path, capture, mask="none")
+    [apart] = [line for line in findings if line.startswith("the very same values under different poses")]
+    assert "poses: view_00 = view_01. " in apart
+    [together] = [line for line in findings if line.startswith("the very same values under one pose")]
+    assert "pose: view_03 = view_04. " in together
 
 
 NAMES = ["view_00", "view_01", "view_02", "view_03"]

@@ -42,7 +42,9 @@ from unmix_plugin.engine.geometry.camera_paths import meeting_point
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import KeyPoses
 from unmix_plugin.engine.sampling import evenly_spaced, robust_deviation
-from unmix_plugin.scenes.doctor import check_lenses, check_masks, contradicted_share
+from unmix_plugin.formats.files import hash_of
+from unmix_plugin.scenes.doctor import check_copies, check_lenses, check_masks, contradicted_share
+from unmix_plugin.scenes.folder import CUBE_KEY
 from unmix_plugin.scenes.reading.cubes import map_array
 from unmix_plugin.spectral.colour.srgb import decode_srgb
 
@@ -169,6 +171,24 @@ def check_views(views: Sequence[SeenView], points: _Points | None) -> list[Remar
             *_of_views(Code.VIEWS_LESS_SHARP, blurred),
         ]
     return [*remarks, *_brightness_of_points(views, points), *_masks(views)]
+
+
+def find_copies(views: Sequence[SeenView], scene: Path) -> list[Remark]:
+    """Views with the values of another one as they are written, of those that show anything; hashed are those alone
+    that their records can't tell apart.
+
+    Args:
+        scene: Folder of the scene.
+    """
+    views = [view for view in views if view.record.matter_share > 0.0]
+    measured = [(view.record.mean_spectrum, view.record.brightness, view.record.detail) for view in views]
+    contents = [
+        hash_of(scene / view.record.paths[CUBE_KEY]) if measured.count(own) > 1 else view.name
+        for view, own in zip(views, measured, strict=True)
+    ]
+    poses = np.array([view.camera.camera_to_world for view in views], np.float64).reshape(-1, 3, 4)
+    found = check_copies([view.name for view in views], contents, poses)
+    return [Remark.of(Code.CAPTURE_WARNING, text=one.sentence()) for one in found]
 
 
 def _cameras(views: Sequence[SeenView], scales: Sequence[float]) -> Cameras:

@@ -7,7 +7,8 @@ Notation: `N` cameras, `P` points.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections import defaultdict
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,7 +18,7 @@ from jaxtyping import Float
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import SceneBox
-from unmix_plugin.errors import SceneError, counted
+from unmix_plugin.errors import SceneError, counted, name_some
 from unmix_plugin.scenes.geometry.bounds import find_bounds
 from unmix_plugin.scenes.geometry.carving import MOST_CONTRADICTED, Cells, Masks, share_contradicted
 from unmix_plugin.scenes.geometry.view_agreement import CONVENTIONS, GIVEN, LEAST_RATIO, MOST_DISAGREEMENT
@@ -28,6 +29,10 @@ from unmix_plugin.spectral.bad_values import BandNoise
 
 _SMALLEST_BASE = 2e-3
 """Distance between two cameras over that of what they see, below which it moves by hardly more than a pixel."""
+_SAME_POSE = 1e-3
+"""Difference of axes, and of places over how far cameras are apart, up to which poses are one."""
+_MOST_COPIES = 5
+"""Groups of copies that are named."""
 _MOST_UNREACHED, _PIXELS_ASKED = 0.002, 2_500
 """Share of a picture that a lens may leave out; pixels by which that is judged."""
 _LEAST_OVERLAP = 0.1
@@ -82,6 +87,31 @@ def check_parallax(positions: Float[np.ndarray, "N 3"], box: SceneBox) -> Findin
     apart = np.linalg.norm(positions - positions[0], axis=1).max()
     away = np.linalg.norm(np.abs(box.aabb.cpu().numpy() - positions[0]).max(axis=0))
     return None if apart > _SMALLEST_BASE * away else Finding.of(Message.CAMERAS_AT_ONE_PLACE)
+
+
+def check_copies(
+    names: Sequence[str], contents: Sequence[Hashable], poses: Float[np.ndarray, "N 3 4"]
+) -> Iterator[Finding]:
+    """Whether views are copies of each other, and whether their poses say otherwise.
+
+    Args:
+        contents: Of each view what is equal where its values are, such as a hash of its file.
+        poses: Of each, of a line camera in its middle.
+    """
+    alike: dict[Hashable, list[int]] = defaultdict(list)
+    for index, content in enumerate(contents):
+        alike[content].append(index)
+    # Places in units of how far the cameras are apart.
+    extent = np.ptp(poses[:, :, 3], axis=0).max() if len(poses) else 0.0
+    compared = poses / np.array([1.0, 1.0, 1.0, extent or 1.0])
+    apart, together = [], []
+    for copies in alike.values():
+        if len(copies) > 1:
+            differ = np.abs(compared[copies] - compared[copies[0]]).max() > _SAME_POSE
+            (apart if differ else together).append(" = ".join(names[index] for index in copies))
+    for code, found in ((Message.COPIES_POSED_APART, apart), (Message.COPIES, together)):
+        if found:
+            yield Finding.of(code, views=name_some(found, _MOST_COPIES))
 
 
 def check_lenses(cameras: Cameras) -> Finding | None:

@@ -268,6 +268,14 @@ class Message(Enum):
         "are, so no other place can be rendered from such views. Move it between views; if it was moved, look whether "
         "each 'transform_matrix' is camera to world: read the other way, all cameras around an object stand at one"
     )
+    COPIES_POSED_APART = (
+        "the very same values under different poses: {views}. At most one pose of each can be true (unless something "
+        "symmetric was rendered without noise): give these views their own files, or leave all but one out"
+    )
+    COPIES = (
+        "the very same values under one pose: {views}. A copy adds nothing to training, and evaluated it is no test: "
+        "leave all but one out"
+    )
     LENS_FOLDS = (
         "the distortion of {views} folds the picture over: no direction leads to {lost:.1%} of its pixels, and their "
         "rays are wrong. Calibrate the lens anew, with points near the corners too, or mask them"

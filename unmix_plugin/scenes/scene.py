@@ -115,6 +115,15 @@ class Scene:
     """World points of what was marked, by name: the corners of printed markers, or single points."""
 
     @property
+    def cube_hashes(self) -> list[str]:
+        """SHA-256 of the cube of each frame."""
+        root, paths = self.root, [frame.cube_path for frame in self.frames]
+        names = [
+            path.relative_to(root).as_posix() if path.is_relative_to(root) else str(path) for path in paths
+        ]
+        return [self.input_hashes[name] for name in names]
+
+    @property
     def has_backdrop(self) -> bool:
         """Whether the training views have no alpha and share a plain backdrop."""
         return self.before_backdrop is not None

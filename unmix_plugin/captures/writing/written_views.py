@@ -17,6 +17,7 @@ from unmix_plugin.captures.checks import (
     check_files,
     check_values,
     check_views,
+    find_copies,
 )
 from unmix_plugin.captures.cube import CaptureView
 from unmix_plugin.captures.match_checks import MatchedScene, check_matches
@@ -93,7 +94,11 @@ def examine(written: WrittenViews, posed: PosedViews) -> Findings:
     bands_nm = plan.sensors[greatest].centers_nm
     alike = {name for name, sensor in plan.sensors.items() if np.array_equal(sensor.centers_nm, bands_nm)}
     checked = check_views([view for view in seen if view.record.sensor in alike], posed.poses.points)
-    checked += [*posed.remarks, *check_files(posed.views, written.options)]
+    checked += [
+        *find_copies(seen, written.folder),
+        *posed.remarks,
+        *check_files(posed.views, written.options),
+    ]
     for name, sensor in plan.sensors.items():
         same = [view for view in seen if view.record.sensor == name]
         samples = [ViewSample.of(view.record, written.folder) for view in same]

@@ -31,6 +31,7 @@ from unmix_plugin.neumatex.tracing.environment import Environment
 from unmix_plugin.neumatex.tracing.light_files import ENVIRONMENT_SUFFIXES, read_environment, read_lamp
 from unmix_plugin.neumatex.tracing.mesh import MESH_SUFFIXES, Mesh, read_mesh, turned_to_viewers
 from unmix_plugin.neumatex.tracing.rays import RayMesh
+from unmix_plugin.scenes.doctor import check_copies
 from unmix_plugin.scenes.placement import Placement
 from unmix_plugin.scenes.reading.cubes import UnreadableArrayError, map_array
 from unmix_plugin.scenes.reading.entries import SceneEntry, read_entries
@@ -173,6 +174,9 @@ def load_object(
     power = folder.lamp(bands) if bands is None or lamp is None else read_lamp(lamp, bands)
     light = folder.environment(bands, power)
     notes += checks.light_doubts(pictures, light)
+    hashes = [pictures.hashes[name] for name in pictures.names]
+    poses = pictures.cameras.camera_to_world.numpy()
+    notes += [found.sentence() for found in check_copies(pictures.names, hashes, poses)]
     relit = root / "relit"
     places = sorted(path for path in relit.iterdir() if path.is_dir()) if relit.is_dir() else []
     held_out = [_read_held_out(place, frame, pictures, bands, power, notes) for place in places]
