@@ -48,7 +48,8 @@ def test_captures_that_see_no_place_often_enough_are_refused(solid, tmp_path):
 def test_runs_that_can_not_be_compared_are_refused_in_one_sentence(trained, run_copy, tmp_path):
     lose_scene(run_copy, trained.scene)
     pair = [trained.run, trained.run, "--output", tmp_path / "out", "--device", "cpu"]
-    assert "say where it is now" in refused(compare, trained.run, run_copy, *pair[2:])
+    assert "name its folder with --after-data" in refused(compare, trained.run, run_copy, *pair[2:])
+    assert "name its folder with --before-data" in refused(compare, run_copy, trained.run, *pair[2:])
     assert "--after-data names 2 scenes for 1 later run" in refused(compare, *pair, "--after-data", "a", "b")
     assert "the level is 2" in refused(compare, *pair, "--level", 2)
     assert "--max-views is 0" in refused(compare, *pair, "--max-views", 0)

@@ -78,12 +78,12 @@ def _compare_all(options: CompareOptions) -> None:
     series = [folder / "series.csv"] if is_series else []
     refuse_to_overwrite([path for one in files for path in one.paths()] + series, options.overwrite)
     with working(console, f"reading {options.before}"):
-        before = open_capture(options.before, options.before_data, options.device)
+        before = open_capture(options.before, options.before_data, options.device, asked_by="--before-data")
     found: list[Comparison] = []
     data = options.after_data or (None,) * len(options.after)
     for path, where, one in zip(options.after, data, files, strict=True):
         with working(console, f"reading {path}"):
-            after = open_capture(path, where, options.device)
+            after = open_capture(path, where, options.device, asked_by="--after-data")
         result = comparing.compare(
             before,
             after,

@@ -235,9 +235,14 @@ def _corners(coords: Float[Tensor, "n 2"], width: int) -> tuple[Tensor, Float[Te
     return corners, weights
 
 
-def open_capture(path: str | Path, data: str | Path | None = None, device: str = "auto") -> Capture:
+def open_capture(
+    path: str | Path, data: str | Path | None = None, device: str = "auto", *, asked_by: str = "data"
+) -> Capture:
     """A run with the scene that it was trained on.
 
+    Args:
+        data: The scene, where it is no longer where the run was trained.
+        asked_by: How a caller names `data` to users, such as `--after-data`.
     Raises:
         RunError: the run is missing or damaged, or the scene is another than the run's.
         SceneError: the scene is no longer there.
@@ -249,7 +254,7 @@ def open_capture(path: str | Path, data: str | Path | None = None, device: str =
     if scene is None:
         raise SceneError(
             f"how sure a change is follows from the views of {path}, and there is no scene, or no longer the same, at "
-            f"{summary.get('root')}; say where it is now"
+            f"{summary.get('root')}; name its folder with {asked_by}"
         )
     measured = MeasuredScene(scene, summary.get("illuminant"))
     found = Capture(

@@ -126,8 +126,8 @@ def compare_runs(
         RunError, SceneError: a run or its scene is missing or damaged.
         ConfigError: they can't be compared: not one object, no overlap, no common bands, another method.
     """
-    first = open_capture(before, before_data, device)
-    second = open_capture(after, after_data, device)
+    first = open_capture(before, before_data, device, asked_by="before_data")
+    second = open_capture(after, after_data, device, asked_by="after_data")
     return compare(first, second, scale=scale, level=level, indices=indices)
 
 
@@ -188,7 +188,7 @@ def _common_bands(
     if chosen.sum() < _FEWEST_BANDS:
         raise ConfigError(
             f"the captures have {int(chosen.sum())} common bands ({before.bands} and {after.bands}); at least "
-            f"{_FEWEST_BANDS} are needed"
+            f"{_FEWEST_BANDS} are needed: compare runs with more bands in one range"
         )
     bands = Bands.of(own[chosen])
     from_others = np.stack([np.interp(bands.centers_nm, others, row) for row in np.eye(len(others))])

@@ -186,7 +186,7 @@ def open_measured(path: str | Path, data: str | Path | None = None) -> MeasuredS
     scene = find_scene(record.summary, run.path, None if data is None else Path(data))
     if scene is None:
         place = record.summary.get("root")
-        raise SceneError(f"no scene, or no longer the same, at {place}; say where it is now")
+        raise SceneError(f"no scene, or no longer the same, at {place}; give its folder as data")
     return MeasuredScene(scene, record.summary.get("illuminant"))
 
 
