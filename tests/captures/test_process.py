@@ -104,6 +104,12 @@ def test_values_that_saturate_far_below_1_are_said_to_be_written_as_it(
     assert any("values are saturated from 0." in finding for finding in findings) == is_said
 
 
+@pytest.mark.parametrize(("scale", "said"), [(100.0, "is too low: "), (4095.0, ""), (1e7, "is too high: ")])
+def test_a_given_scale_that_must_be_wrong_is_said(tmp_path, capture, scale, said):
+    _, findings = made(tmp_path, capture, scale=scale)
+    assert [said in line for line in findings if line.startswith("--scale")] == [True] * bool(said)
+
+
 def test_poses_in_an_array_beside_the_cubes_are_no_view(tmp_path: Path, capture):
     frames = json.loads((capture.root / "transforms.json").read_text())["frames"]
     matrices = np.array([frame["transform_matrix"] for frame in frames])[:, :3]

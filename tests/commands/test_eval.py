@@ -108,14 +108,16 @@ def test_without_run_the_newest_is_evaluated_and_named(run_copy, monkeypatch):
     assert "no run with a checkpoint" in refused(evaluate, "--output-dir", older)
 
 
+@pytest.mark.parametrize("name", ["figures", "outputs"])
 @pytest.mark.parametrize("command", [evaluate, export, render, view])
-def test_a_folder_to_look_for_runs_is_refused_beside_a_run(command, tmp_path):
+def test_a_folder_to_look_for_runs_is_refused_beside_a_run(command, name, tmp_path, monkeypatch):
     """Elsewhere the flag says where to write; here it would do nothing."""
+    monkeypatch.chdir(tmp_path)
     word = ["endmembers"] if command is export else []
-    said = refused(command, *word, "--run", tmp_path, "--output-dir", tmp_path / "figures")
+    said = refused(command, *word, "--run", tmp_path, "--output-dir", name)
     assert "a run is named" in said
     assert "The folder to write to is --output" in said
-    assert not (tmp_path / "figures").exists()
+    assert not (tmp_path / name).exists()
 
 
 def test_a_folder_to_look_for_runs_is_refused_beside_runs_to_compare(tmp_path):

@@ -65,6 +65,8 @@ _WHITE_PERCENTILE = 99.0
 """Of sampled pixels; shown as white in pictures."""
 _LEAST_END = 0.9
 """Of what is written as 1: saturated values below are too far off. Columns and bands differ in their ends a little."""
+_MOST_ABOVE_GIVEN, _LEAST_OF_GIVEN = 0.5, 0.01
+"""Share of sampled values above a given scale, and their greatest over it, beyond which the scale must be wrong."""
 _FEW_PERCENTILE = 5.0
 """Of saturated values: nearly the darkest."""
 
@@ -444,6 +446,13 @@ def _remarks_on_values(
             "hint": " (was the white exposed and lit as the views were?)" if has_white else "",
         }
         remarks.append(Remark(Code.ONE_LOST_ABOVE if scale.value > 1 else Code.ONE_LOST_BELOW, facts))
+    greatest = max(float(sensor.sample.max(initial=0.0)) for sensor in sensors.values())
+    above = max(float((sensor.sample > scale.value).mean()) for sensor in sensors.values())
+    if scale.is_given and (above > _MOST_ABOVE_GIVEN or greatest < _LEAST_OF_GIVEN * scale.value):
+        facts = {"scale": f"{scale.value:g}", "greatest": f"{greatest:g}"}
+        low = Remark.of(Code.GIVEN_SCALE_LOW, share=f"{above:.0%}", **facts)
+        high = Remark.of(Code.GIVEN_SCALE_HIGH, limit=f"{_LEAST_OF_GIVEN:g}", **facts)
+        remarks.append(low if above > _MOST_ABOVE_GIVEN else high)
     named_already = any(remark.code is Code.NO_DATA_UNNAMED for remark in remarks)
     if not named_already and any(is_below_black(sensor.sample) for sensor in sensors.values()):
         remarks.append(Remark.of(Code.BELOW_BLACK))

@@ -287,6 +287,13 @@ class Code(Enum):
         "undo it, and exported radiance times {scale} is what was measured; --scale 1 keeps values, and cuts off those "
         "above 1"
     )
+    GIVEN_SCALE_LOW = _wrong(
+        "--scale {scale} is too low: {share} of the sampled values are above it, up to {greatest}, and are written as 1"
+    )
+    GIVEN_SCALE_HIGH = _wrong(
+        "--scale {scale} is too high: of the sampled values none is above {greatest}, and all are written as less than "
+        "{limit}; without --scale it is found from the values"
+    )
     BELOW_BLACK = _wrong(
         "values lie below 0 by more than noise, and are written as 0: the dark frame is brighter than that of these "
         "views, or was taken off their numbers before"

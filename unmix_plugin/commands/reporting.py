@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, TypeVar
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
 
+from unmix_plugin.engine.configs import TrainerConfig
 from unmix_plugin.engine.printing import cleaned, tell
 from unmix_plugin.engine.runs.run_folder import newest_run
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.products.product import RunOptions
 
 if TYPE_CHECKING:
     from unmix_plugin.engine.model import DataManager
@@ -34,8 +34,8 @@ def shell_line(*words: object) -> str:
     return subprocess.list2cmdline(texts) if _IS_WINDOWS else shlex.join(texts)
 
 
-def chosen_run(run: Path | None, output_dir: Path) -> Path:
-    """The run folder named, or the newest under `output_dir`, which is then printed.
+def chosen_run(run: Path | None, output_dir: Path | None) -> Path:
+    """The run folder named, or the newest under `output_dir`, which is then printed; None: where training writes.
 
     Raises:
         ConfigError: a run is named, and a folder to look for one, which would do nothing.
@@ -44,14 +44,14 @@ def chosen_run(run: Path | None, output_dir: Path) -> Path:
     if run is not None:
         refuse_to_look(output_dir)
         return run
-    newest = newest_run(output_dir).path
+    newest = newest_run(output_dir or TrainerConfig.output_dir).path
     tell(f"newest run: {newest}")
     return newest
 
 
-def refuse_to_look(output_dir: Path) -> None:
-    """Refuse another folder than the usual one to look for the newest run, where runs are named. Raises ConfigError."""
-    if output_dir != RunOptions.output_dir:
+def refuse_to_look(output_dir: Path | None) -> None:
+    """Refuse a folder to look for the newest run in, where runs are named. Raises ConfigError."""
+    if output_dir is not None:
         raise ConfigError(
             f"--output-dir {output_dir} is where the newest run is looked for, and a run is named: leave one of them "
             "out. The folder to write to is --output, of commands that have it"

@@ -31,8 +31,8 @@ class RunOptions:
 
     run: Path | None = None
     """Run folder, as training printed it; None takes the newest under --output-dir."""
-    output_dir: Path = Path("outputs")
-    """Folder in which to look for the newest run."""
+    output_dir: Path | None = None
+    """Folder in which to look for the newest run; None: outputs/, where training writes."""
     device: DeviceName = "auto"
     """Where to compute; auto takes CUDA where there is one."""
 

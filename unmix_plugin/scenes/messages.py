@@ -235,9 +235,13 @@ class Message(Enum):
 
     # Warnings
     CLIPPED = (
-        "{cubes}: up to {share:.0%} of the values are above 1 after division by the value scale {scale:g} and count "
+        "{cubes}: up to {share:.2g} of the values are above 1 after division by the value scale {scale:g} and count "
         "as 1 "
         "(up to {greatest:g} as stored); if they are no highlights, give --value-scale {proposed:g}"
+    )
+    DARK_VALUES = (
+        "no value of the cubes is above {share:.2g}{given} (up to {greatest:g} as stored): what a scene shows should "
+        "reach up to 1; if it was not that dark, give --value-scale {proposed:g}"
     )
     KEY_NOT_FOLLOWED = "'{key}' is set and not followed: it stands for {meaning}"
     LENS_TWICE = (

@@ -70,9 +70,30 @@ def test_a_scale_that_clips_more_than_highlights_is_said_with_one_that_does_not(
 
     (said,) = read(6000.0)
     share = max((np.load(path) > 6000).mean() for path in (folder.root / "cubes").iterdir())
-    assert f"up to {share:.0%} of the values are above 1 after division by the value scale 6000" in said
+    assert f"up to {share:.2g} of the values are above 1 after division by the value scale 6000" in said
     assert "(up to 7998 as stored); if they are no highlights, give --value-scale 10000" in said
     assert not read(10000.0)
+
+
+def test_values_far_above_the_scale_in_few_places_or_far_below_it_everywhere_are_said(folder):
+    folder.edit_cubes(lambda cube: np.round(cube.astype(np.float64) * 900).astype(np.uint16))
+
+    def read(scale):
+        return load_scene(folder.root, SceneOptions(value_scale=scale)).warnings
+
+    assert not read(1023.0)
+    (dark,) = read(250_000.0)
+    assert "no value of the cubes is above 0.0029 after division by the value scale 250000 (up to 720" in dark
+    assert "give --value-scale 1023" in dark
+
+    def brighten(cube):
+        cube[0, 0] = 20_000
+        return cube
+
+    folder.edit_cube(1, brighten)
+    (bright,) = read(1023.0)
+    assert "cubes/view_1.npy: up to 0.00" in bright
+    assert "up to 20000 as stored" in bright
 
 
 @pytest.mark.parametrize(

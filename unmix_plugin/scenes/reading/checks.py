@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float64
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.scenes.folder import CUBE_KEY
 from unmix_plugin.scenes.messages import Message
-from unmix_plugin.scenes.reading.cubes import check_abundances, check_cubes, warn_clipped
+from unmix_plugin.scenes.reading.cubes import check_abundances, check_cubes, warn_of_scale
 from unmix_plugin.scenes.reading.entries import FrameEntry, Shape
 from unmix_plugin.scenes.reading.faults import Faults
 from unmix_plugin.scenes.reading.images import check_colours, check_labels, check_masks
@@ -102,7 +102,7 @@ def check_frames(
                 foreground=foreground,
             )
         )
-    return CheckedFiles(tuple(checked), sensors, warn_clipped(cubes, options.value_scale))
+    return CheckedFiles(tuple(checked), sensors, warn_of_scale(cubes, options.value_scale))
 
 
 def _union(one: _Pixels | None, other: _Pixels | None) -> _Pixels | None:

@@ -36,7 +36,9 @@ _EXCESS_SHARE = 0.01
 """Share of values above 1 that is still taken for saturated highlights when no scale was given; also share of values
 far below 0 that a cube with noise around black may have."""
 _EXCESS_VALUE = 10.0
-"""Greatest value that is still taken for a highlight when no scale was given."""
+"""Greatest value that is still taken for a highlight; beyond it one is refused without a scale, and named with one."""
+_LEAST_GREATEST = 0.01
+"""Of the greatest value of all cubes; below it the scale must be wrong, or no light was there."""
 _NOISE = 0.1
 """Negative values above minus this may be noise around black."""
 _EXCESS_SHARE_SCALED = 0.5
@@ -322,9 +324,25 @@ def _check_values(
     return measured
 
 
-def warn_clipped(cubes: Sequence[_CubeValues], value_scale: float | None) -> tuple[str, ...]:
-    """Warnings of a given scale that makes more than highlights brighter than 1."""
-    clipped = [cube for cube in cubes if cube.share_above_one > _EXCESS_SHARE]
+def warn_of_scale(cubes: Sequence[_CubeValues], value_scale: float | None) -> tuple[str, ...]:
+    """Warnings of a given scale that makes more than highlights brighter than 1, or some far brighter; and of values
+    that are all next to 0."""
+    scale = value_scale or 1.0
+    greatest = max((cube.greatest for cube in cubes), default=0.0)
+    if 0.0 < greatest < _LEAST_GREATEST * scale:
+        return (
+            Message.DARK_VALUES.sentence(
+                share=greatest / scale,
+                given="" if value_scale is None else f" after division by the value scale {scale:g}",
+                greatest=greatest,
+                proposed=_propose_scale(cubes),
+            ),
+        )
+    clipped = [
+        cube
+        for cube in cubes
+        if cube.share_above_one > _EXCESS_SHARE or cube.greatest > _EXCESS_VALUE * scale
+    ]
     if value_scale is None or not clipped:
         return ()
     warning = Message.CLIPPED.sentence(
