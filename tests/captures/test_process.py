@@ -179,6 +179,36 @@ def test_a_band_that_the_white_marks_as_bad_is_left_out(tmp_path: Path, capture)
     np.testing.assert_array_equal(scene.wavelengths_nm, np.delete(WAVELENGTHS_NM, 3))
 
 
+@pytest.mark.parametrize("is_marked", [True, False])
+@pytest.mark.parametrize("name", ["white", "dark"])
+def test_a_reference_that_measured_nothing_in_a_band_serves_in_the_others(tmp_path, capture, name, is_marked):
+    counts = counts_of(capture.root / f"{name}.raw").copy()
+    counts[..., 3] = 65535
+    marks = {"bbl": "{1, 1, 1, 0, 1, 1, 1, 1, 1}"} if is_marked else {}
+    write_cube(capture.root, name, counts, header={"data ignore value": 65535, **marks})
+    scene, findings = made(tmp_path, capture, **references_of(capture))
+    np.testing.assert_array_equal(scene.wavelengths_nm, np.delete(WAVELENGTHS_NM, 3))
+    expected = np.delete(capture.reflectance["view_00"], 3, axis=2)
+    np.testing.assert_allclose(scene.cube(0), expected, atol=1.0 / 1000)
+    said = f"{name}.hdr: nothing was measured in {WAVELENGTHS_NM[3]:g} nm (NaN or no-data): these bands are left out"
+    assert (said in findings) == (not is_marked)
+    reason = f"marked as bad in the {name}" if is_marked else "a reference measured nothing there"
+    assert reason in (tmp_path / "scene" / "report.txt").read_text()
+
+
+def test_a_panel_in_views_with_an_unmeasured_bad_band_serves_in_the_others(tmp_path, capture):
+    marks = {"data ignore value": 65535, "bbl": "{1, 1, 1, 0, 1, 1, 1, 1, 1}"}
+    for name in capture.reflectance:
+        counts = counts_of(capture.root / f"{name}.raw").copy()
+        counts[2:6, 2:6] = np.random.default_rng(0).integers(3000, 3100, (4, 4, BANDS))
+        counts[..., 3] = 65535
+        write_cube(capture.root, name, counts, header=marks)
+    rectangle = ("view_00", 2, 2, 4, 4)
+    scene, _ = made(tmp_path, capture, white_rectangle=rectangle, dark=capture.root / "dark.hdr", scale=1.0)
+    np.testing.assert_array_equal(scene.wavelengths_nm, np.delete(WAVELENGTHS_NM, 3))
+    np.testing.assert_allclose(scene.cube(0)[2:6, 2:6], 1.0, atol=0.05)
+
+
 @pytest.mark.parametrize("has_file", [False, True])
 def test_dark_lines_of_a_file_are_its_dark_frame_where_it_has_no_other(tmp_path, capture, has_file: bool):
     """Specim's line cameras close the shutter for the last lines; poses and masks may be made for all of them."""

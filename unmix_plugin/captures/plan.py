@@ -15,7 +15,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
-from unmix_plugin.captures.calibration.bands import BandChoice, stated_bands, without_bad, without_unlit
+from unmix_plugin.captures.calibration.bands import (
+    BandChoice,
+    stated_bands,
+    without_bad,
+    without_unlit,
+    without_unmeasured,
+)
 from unmix_plugin.captures.calibration.calibration import (
     Calibration,
     Raster,
@@ -315,7 +321,7 @@ def plan_sensor(
         saturation = Saturation(model.saturated, f"known of {model.maker}")
     else:
         saturation = find_saturation(count_stored(files, bands.kept))
-    remarks: list[Remark] = []
+    bands, remarks = without_unmeasured(bands, references)
     for white in references.whites:
         bands, found = without_unlit(bands, white, saturated_bands(WhiteSample.of(white), saturation.stored))
         remarks += found

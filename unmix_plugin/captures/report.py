@@ -362,6 +362,9 @@ class Code(Enum):
         "{file}: the white is saturated in {bands}: these bands are left out; take it again with a shorter "
         "exposure"
     )
+    REFERENCE_UNMEASURED = _wrong(
+        "{file}: nothing was measured in {bands} (NaN or no-data): these bands are left out"
+    )
     NOISY_BANDS_KEPT = _done(
         "{noisy} of {bands} bands have noise above {limit} of their signal; all are kept"
     )

@@ -12,7 +12,7 @@ from enum import Enum
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
-from unmix_plugin.captures.calibration.references import Reference
+from unmix_plugin.captures.calibration.references import Reference, SensorReferences
 from unmix_plugin.captures.cube import MOST_WIDTH, Cube
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.readers.derived import said_of_mosaic
@@ -42,6 +42,8 @@ class BandFault(Enum):
     NAMED = "named in --drop-bands"
     WHITE_SATURATED = "the white reference is saturated there"
     WHITE_MARKED = "marked as bad in the white reference"
+    DARK_MARKED = "marked as bad in the dark frame"
+    UNMEASURED = "a reference measured nothing there"
     WHITE_DARK = "the white reference has no light there"
     NOISY = "noise is {:.0%} of the signal"
     SATURATED = f"saturated in more than {_MOST_SATURATED:.0%} of sampled pixels"
@@ -150,11 +152,27 @@ def stated_bands(files: Sequence[Cube], options: ProcessOptions) -> BandChoice:
     return choice
 
 
+def without_unmeasured(choice: BandChoice, references: SensorReferences) -> tuple[BandChoice, list[Remark]]:
+    """The choice without bands that a reference marks as bad or measured nothing in, and remarks on the latter."""
+    whites, remarks = {white.file.path for white in references.whites}, dict[str, Remark]()
+    for reference in references.all:
+        file, bands = reference.file, np.arange(len(choice.wavelengths_nm))
+        if file.bands.bad is not None:
+            fault = BandFault.WHITE_MARKED if file.path in whites else BandFault.DARK_MARKED
+            choice = choice.without(file.bands.bad, fault)
+        lacking = ~np.isin(bands, [*reference.measured, *choice.dropped])
+        if lacking.any():
+            listed = [f"{nm:g} nm" for nm in choice.wavelengths_nm[lacking]]
+            remarks[file.path.name] = Remark.of(Code.REFERENCE_UNMEASURED, file=file.path.name, bands=listed)
+            choice = choice.without(lacking, BandFault.UNMEASURED)
+    return choice, [*remarks.values()]
+
+
 def without_unlit(
     choice: BandChoice, white: Reference, saturated: Bool[np.ndarray, " B"]
 ) -> tuple[BandChoice, list[Remark]]:
-    """The choice without bands in which a white reference is saturated, marked as bad, or has no light, and a remark on
-    saturated ones. Raises CaptureError: most of the white is saturated."""
+    """The choice without bands in which a white reference is saturated or has no light, and a remark on saturated ones.
+    Raises CaptureError: most of the white is saturated."""
     path = white.file.path
     if saturated.mean() > _MOST_SATURATED_WHITE:
         raise CaptureError(
@@ -163,8 +181,6 @@ def without_unlit(
     listed = [f"{nm:g} nm" for nm in choice.wavelengths_nm[saturated]]
     remarks = [Remark.of(Code.WHITE_SATURATED, file=path.name, bands=listed)] if listed else []
     choice = choice.without(saturated, BandFault.WHITE_SATURATED)
-    if white.file.bands.bad is not None:
-        choice = choice.without(white.file.bands.bad, BandFault.WHITE_MARKED)
     is_dark = white.signal < _LEAST_WHITE * white.signal.max()
     return choice.without(is_dark, BandFault.WHITE_DARK), remarks
 

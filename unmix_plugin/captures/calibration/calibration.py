@@ -314,6 +314,7 @@ class WhiteSample:
     """Some rows of the panel of a white reference."""
 
     stored: Shaped[np.ndarray, "n columns B"]
+    """0 in bands that are not measured."""
     is_measured: Bool[np.ndarray, "n columns"]
 
     @staticmethod
@@ -323,9 +324,10 @@ class WhiteSample:
         columns, read, measured = slice(left, left + width), [], []
         for row in sampled_rows(height):
             line = slice(top + row, top + row + 1)
-            numbers = white.file.read(line)
+            numbers, bands = white.file.read(line), white.measured
+            measured.append(~find_missing(numbers[..., bands], white.file, line, bands)[:, columns])
+            numbers[..., np.setdiff1d(np.arange(numbers.shape[-1]), bands)] = 0
             read.append(numbers[:, columns])
-            measured.append(~find_missing(numbers, white.file, line)[:, columns])
         return WhiteSample(np.concatenate(read), np.concatenate(measured))
 
 

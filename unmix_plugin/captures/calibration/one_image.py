@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int
 
-from unmix_plugin.captures.calibration.bands import BandChoice, without_unlit
+from unmix_plugin.captures.calibration.bands import BandChoice, without_unlit, without_unmeasured
 from unmix_plugin.captures.calibration.calibration import (
     Calibration,
     Raster,
@@ -20,8 +20,13 @@ from unmix_plugin.captures.calibration.calibration import (
     count_stored,
     find_unnamed_no_data,
 )
-from unmix_plugin.captures.calibration.references import GivenReferences, SensorReferences, find_references
-from unmix_plugin.captures.cube import CaptureView, Cube, Meaning, find_missing
+from unmix_plugin.captures.calibration.references import (
+    GivenReferences,
+    SensorReferences,
+    find_references,
+    measured_bands,
+)
+from unmix_plugin.captures.cube import CaptureView, Cube, Meaning
 from unmix_plugin.captures.decide import (
     ExposedFiles,
     compare_exposures,
@@ -78,7 +83,7 @@ def calibrate_image(
         )
     options = ProcessOptions("cubes", file.path, Path(), white_reflectance=white_reflectance)
     references = find_references([view], known, options, given, [view])
-    choice, remarks = BandChoice(known, file.bands.source), []
+    choice, remarks = without_unmeasured(BandChoice(known, file.bands.source), references)
     bands = _good_bands(file)
     saturation = find_saturation(count_stored([file], bands)) if references.whites else None
     for white in references.whites:
@@ -119,7 +124,9 @@ def calibrate_image(
     notes = [f"{kind} {one.file.path.name}: {one.how}" for kind, one in named if one]
     notes += sentences(remarks, Kind.DONE)
     notes += (
-        [f"{counted(unlit, 'band')} without light on the white, or saturated there, left out"]
+        [
+            f"{counted(unlit, 'band')} left out: no light on the white, saturated there, or a reference not measured"
+        ]
         if unlit
         else []
     )
@@ -141,18 +148,13 @@ def calibrate_image(
 def _good_bands(file: Cube) -> np.ndarray:
     """Bands that the file does not mark as bad, that are measured somewhere, and of one wavelength the first."""
     table = file.bands
-    kept = np.arange(file.shape[2]) if table.bad is None else np.flatnonzero(~table.bad)
-    if len(kept) == 0:
+    if table.bad is not None and table.bad.all():
         raise CaptureError(f"{file.path}: the file marks all of its bands as bad")
+    kept = measured_bands(file)  # EnMAP has no numbers where the air lets no light through.
     if table.wavelengths_nm is not None:
         _, first = np.unique(table.wavelengths_nm[kept], return_index=True)
         kept = kept[first]
-    # EnMAP has no numbers where the air lets no light through.
-    every = slice(0, file.shape[0])
-    lacking = [
-        find_missing(file.read(every, kept[[i]]), file, every, kept[[i]]).all() for i in range(len(kept))
-    ]
-    return kept if all(lacking) else kept[~np.array(lacking)]
+    return kept
 
 
 def _doubts(file: Cube, bands: np.ndarray, references: SensorReferences) -> list[str]:

@@ -12,7 +12,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Bool, Float32, Float64, Int
 
 from unmix_plugin.captures.camera_tags import radiometric_model
 from unmix_plugin.captures.cube import (
@@ -130,7 +130,9 @@ class Reference:
 
     file: Cube
     mean: Float32[np.ndarray, "1 columns B"]
-    """Mean over its lines; one column where it stands for all."""
+    """Mean over its lines; one column where it stands for all. 0 in bands that are not measured."""
+    measured: Int[np.ndarray, " b"]
+    """Bands of the file that it can serve in, as `measured_bands` has them."""
     is_per_pixel: bool
     """Whether each pixel has its own value, read from the file when needed."""
     how: str
@@ -164,8 +166,34 @@ class Reference:
             return counts if self.dark is None else counts - self.dark.signal
         top, left, height, width = self.rectangle
         lines, columns = slice(top, top + height), slice(left, left + width)
-        behind = self.dark.rows(lines, columns, np.arange(len(counts)))
-        return counts - np.nanmean(behind, axis=(0, 1), dtype=np.float64)
+        bands = self.dark.measured
+        counts[bands] -= np.nanmean(self.dark.rows(lines, columns, bands), axis=(0, 1), dtype=np.float64)
+        return counts
+
+
+def measured_bands(
+    file: Cube, bad: Bool[np.ndarray, " B"] | None = None, rows: slice = slice(None)
+) -> Int[np.ndarray, " b"]:
+    """Bands that are not marked as bad and in which a pixel was measured; of those, all where nothing was.
+
+    Args:
+        bad: Marks beside those of the file.
+        rows: Where to look.
+    """
+    marks = file.bands.marking(bad).bad
+    first, last, _ = rows.indices(file.shape[0])
+    kept = np.arange(file.shape[2]) if marks is None or marks.all() else np.flatnonzero(~marks)
+    is_seen = np.zeros(len(kept), bool)
+    step = max(1, _BLOCK_VALUES // (file.shape[1] * len(kept)))
+    for begin in range(first, last, step):
+        part = slice(begin, min(begin + step, last))
+        stored = file.read(part, kept)
+        for index in np.flatnonzero(~is_seen).tolist():
+            band = slice(index, index + 1)
+            is_seen[index] = not find_missing(stored[..., band], file, part, kept[band]).all()
+        if is_seen.all():
+            break
+    return kept[is_seen] if is_seen.any() else kept
 
 
 def open_reference(file: Cube, kind: ReferenceKind, cube: Cube) -> Reference:
@@ -173,8 +201,9 @@ def open_reference(file: Cube, kind: ReferenceKind, cube: Cube) -> Reference:
 
     A file with as many rows and columns as the cubes is used pixel by pixel if its rows differ by more than noise (a
     camera that takes whole images), and by the mean of its lines otherwise (a line camera). Pixels without a
-    measurement are left out of it, where 0 in a dark frame is one whatever its header says. Raises CaptureError: other
-    bands than the cubes, other units, or a column without a measurement.
+    measurement are left out of it, where 0 in a dark frame is one whatever its header says. Bands that it or the cube
+    marks as bad, or that it measured nothing in, don't count. Raises CaptureError: other bands than the cubes, other
+    units, or a column without a measurement.
     """
     if kind is ReferenceKind.DARK:  # software writes one no-data value into all headers of a capture
         file = replace(file, no_data=tuple(number for number in file.no_data if number != 0))
@@ -186,32 +215,34 @@ def open_reference(file: Cube, kind: ReferenceKind, cube: Cube) -> Reference:
         )
     require_comparable(file, cube)
     # Mean over lines, NaN where nothing was measured.
-    total, count = np.zeros((width, bands)), np.zeros((width, bands))
+    measured = measured_bands(file, cube.bands.bad)
+    total, count = np.zeros((width, len(measured))), np.zeros((width, len(measured)))
     missing = np.zeros((height, width), bool)
     step = max(1, _BLOCK_VALUES // (width * bands))
     for first in range(0, height, step):
         part = slice(first, min(first + step, height))
-        stored = file.read(part)
-        missing[part] = find_missing(stored, file, part)
-        values = stated_values(file, stored, part)
+        stored = file.read(part, measured)
+        missing[part] = find_missing(stored, file, part, measured)
+        values = stated_values(file, stored, part, measured)
         values[missing[part]] = np.nan
         total += np.nansum(values, axis=0, dtype=np.float64)
         count += np.isfinite(values).sum(axis=0)
     precise = total / np.where(count > 0, count, np.nan)
-    mean = precise[None].astype(np.float32)
+    mean = np.zeros((1, width, bands), np.float32)
+    mean[..., measured] = precise
     if not np.isfinite(mean).all():
         raise CaptureError(
             f"{file.path}: the {kind.value} has columns without a measurement (NaN, infinite or no-data); take it again"
         )
     pattern = 0.0
     if (height, width) == cube.shape[:2] and height > 1:
-        pattern = _pattern_of_rows(file, precise, missing)
+        pattern = _pattern_of_rows(file, measured, precise, missing)
     if pattern > _MOST_PATTERN:
         how = f"pixel by pixel, as its rows differ ({pattern:.1f} times what noise explains)"
-        return Reference(file, mean, True, how)
+        return Reference(file, mean, measured, True, how)
     lines = f"mean of {height} line{'s' if height > 1 else ''}"
     if width == cube.shape[1]:
-        return Reference(file, mean, False, f"{lines}, column by column")
+        return Reference(file, mean, measured, False, f"{lines}, column by column")
     ratio = max(width, cube.shape[1]) / min(width, cube.shape[1])
     wider = f"it is {width} columns wide and the cubes {cube.shape[1]}"
     if ratio == int(ratio) and width > 1:  # both lines span the same field
@@ -224,9 +255,9 @@ def open_reference(file: Cube, kind: ReferenceKind, cube: Cube) -> Reference:
             high = np.minimum(low + 1, width - 1)
             part_way = np.clip(at - low, 0.0, 1.0)[None, :, None].astype(np.float32)
             mean = mean[:, low] * (1 - part_way) + mean[:, high] * part_way
-        return Reference(file, mean, False, how)
+        return Reference(file, mean, measured, False, how)
     how = f"{lines} and of all columns: {wider}, so its columns can't be those of the cubes"
-    return Reference(file, mean.mean(axis=1, keepdims=True), False, how)
+    return Reference(file, mean.mean(axis=1, keepdims=True), measured, False, how)
 
 
 def _open_white(file: Cube, own_dark: Cube | None, cube: Cube) -> Reference:
@@ -250,12 +281,14 @@ def panel_reference(cube: Cube, rectangle: tuple[int, int, int, int], view: str)
     top, left, height, width = rectangle
     refuse_outside(f"--white-rectangle {view}", rectangle, cube.shape[:2])
     lines = slice(top, top + height)
-    values = _measured(cube, lines)[:, left : left + width].astype(np.float64)
+    measured = measured_bands(cube, rows=lines)
+    values = _measured(cube, lines, measured)[:, left : left + width].astype(np.float64)
     if np.isnan(values[..., 0]).all():
         raise CaptureError(f"{cube.path}: no pixel of --white-rectangle holds a measurement; name another")
-    mean = np.nanmean(values, axis=(0, 1), keepdims=True).astype(np.float32)
+    mean = np.zeros((1, 1, cube.shape[2]), np.float32)
+    mean[..., measured] = np.nanmean(values, axis=(0, 1))
     how = f"mean of {height} x {width} pixels from row {top} and column {left} of view {view}"
-    return Reference(cube, mean, False, how, rectangle=rectangle)
+    return Reference(cube, mean, measured, False, how, rectangle=rectangle)
 
 
 def refuse_outside(what: str, rectangle: tuple[int, int, int, int], size: tuple[int, int]) -> None:
@@ -267,14 +300,19 @@ def refuse_outside(what: str, rectangle: tuple[int, int, int, int], size: tuple[
         raise ConfigError(f"{where} leaves the image of {size[0]} rows and {size[1]} columns")
 
 
-def _pattern_of_rows(file: Cube, mean: Float64[np.ndarray, "W B"], missing: Bool[np.ndarray, "H W"]) -> float:
+def _pattern_of_rows(
+    file: Cube,
+    measured: Int[np.ndarray, " b"],
+    mean: Float64[np.ndarray, "W b"],
+    missing: Bool[np.ndarray, "H W"],
+) -> float:
     """How much more than noise the rows differ from their mean, judged on a few bands: the variance of the means of
     square blocks, as a multiple of what pixels that differ by noise alone would give."""
-    height, width, bands = file.shape
+    height, width, _ = file.shape
     every, side, patterns = slice(0, height), _PATTERN_BLOCK_PX, []
     down, across = height // side, width // side
-    for band in np.unique(np.linspace(0, bands - 1, 5).astype(int)):
-        index = np.array([band])
+    for band in np.unique(np.linspace(0, len(measured) - 1, 5).astype(int)):
+        index = measured[[band]]
         values = stated_values(file, file.read(every, index), every, index)[..., 0]
         residual = np.nan_to_num(np.where(missing, 0.0, values - mean[:, band]))
         variance = residual.var()
@@ -291,7 +329,7 @@ def _as_white(
 ) -> Reference:
     """A white panel that is brighter than its dark, with its reflectance: a number, or that of a table."""
     white = replace(panel, dark=panel.dark or dark)
-    light = white.signal
+    light = white.signal[white.measured]
     if not (light > 0).mean() > 0.5:
         dark_name = "0" if white.dark is None else f"the dark frame {white.dark.file.path}"
         raise CaptureError(
@@ -357,6 +395,13 @@ class SensorReferences:
         """All white references, one a view where views have their own."""
         used = [*self.by_view.values()] or [self.common]
         return [references.white for references in used if references.white is not None]
+
+    @property
+    def all(self) -> list[Reference]:
+        """Every reference that is used, dark frames of white references too."""
+        used = [*self.by_view.values()] or [self.common]
+        pairs = [(one.dark, one.white, one.white and one.white.dark) for one in used]
+        return [reference for pair in pairs for reference in pair if reference is not None]
 
     def darks_beside(self, files: Sequence[Cube]) -> list[tuple[Cube, Cube]]:
         """Each dark frame with the file that it is subtracted from: a view's, or that of a white reference."""
