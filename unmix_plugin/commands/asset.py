@@ -171,10 +171,13 @@ def _write_manifest(folder: Path, field: Path, path: Path) -> Path:
     scene, data = loaded.scene, loaded.config.data
     assert isinstance(scene, TrainedObject)
     assert scene.bands is not None
-    light = scene.environment
+    light, about = scene.environment, "light that the materials were fitted in"
+    if light.moves is not None:
+        about += ", which turned with the camera, as it stood for the first view"
+        light = light.seen_from(scene.views[0].camera.camera_to_world[0, :, 3])
+    about += "; +z of the world is the top, its +x the middle column"
     height, width = light.image.shape[:2]
     upright = light.radiance(directions_of_pixels(height, width).flatten(0, 1)).view(height, width, -1)
-    about = "light of the pictures; +z of the world is the top, its +x the middle column"
     write_spectral_exr(folder / _ENVIRONMENT, upright.numpy(), scene.bands, None, comments=about)
     figures: dict[str, Any] = json.loads((loaded.folder.eval / "metrics.json").read_text(encoding="utf-8"))
     figures.pop("per_image", None)

@@ -367,14 +367,10 @@ class _Smoothing:
 
     def __init__(self, surface: Surface) -> None:
         """With links along the edges of its triangles."""
-        from scipy.sparse import coo_matrix, identity
+        from scipy.sparse import identity
 
-        mesh, count = TriangleMesh(surface.positions, surface.faces), len(surface.positions)
-        edges = mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-        both = np.concatenate([edges, edges[:, ::-1]])
-        links = coo_matrix((np.ones(len(both)), (both[:, 0], both[:, 1])), shape=(count, count)).tocsr()
-        links.data[:] = 1.0
-        self._links = (links + identity(count)).tocsr()
+        links = TriangleMesh(surface.positions, surface.faces).links()
+        self._links = (links + identity(len(surface.positions))).tocsr()
 
     def places(self, values: Float[np.ndarray, " P"], rings: int) -> Float64[np.ndarray, " P"]:
         """One number a place; NaN stays."""

@@ -21,8 +21,20 @@ from torch.nn.functional import normalize
 _PACE = 0.4
 """Shift of the lamp, in its first distance, for a change of its parameter by 1."""
 LampFrame = Literal["turntable", "camera"]
-_FRAMES: tuple[LampFrame, ...] = ("turntable", "camera")
+LAMP_FRAMES: tuple[LampFrame, ...] = ("turntable", "camera")
 Triple = tuple[float, float, float]
+
+
+def moving_axes(
+    origins: Float[Tensor, "R 3"], middle: Float[Tensor, "3"], axis: Float[Tensor, "3"], frame: LampFrame
+) -> tuple[Float[Tensor, "R 3"], Float[Tensor, "R 3"], Float[Tensor, "R 3"]]:
+    """Unit vectors to the right, up and towards the camera of the frame of rays that start at `origins`."""
+    axis = axis.expand_as(origins)
+    back = normalize(origins - middle, dim=-1)
+    right = normalize(torch.linalg.cross(axis, back), dim=-1)
+    if frame == "turntable":
+        back = torch.linalg.cross(right, axis)
+    return right, torch.linalg.cross(back, right), back
 
 
 @dataclass(frozen=True)
@@ -40,14 +52,14 @@ class Lamp:
 
     def numbers(self) -> tuple[float, ...]:
         """Ten numbers: 0 for a turntable's frame or 1 for the camera's, then the three points."""
-        return (float(_FRAMES.index(self.frame)), *self.middle, *self.axis, *self.place)
+        return (float(LAMP_FRAMES.index(self.frame)), *self.middle, *self.axis, *self.place)
 
     @staticmethod
     def of_numbers(numbers: Sequence[float]) -> Lamp:
         """The lamp of ten numbers; the axis may have any length but 0."""
         middle, axis, place = ((numbers[i], numbers[i + 1], numbers[i + 2]) for i in (1, 4, 7))
         x, y, z = (part / math.hypot(*axis) for part in axis)
-        return Lamp(_FRAMES[int(numbers[0])], middle, (x, y, z), place)
+        return Lamp(LAMP_FRAMES[int(numbers[0])], middle, (x, y, z), place)
 
 
 class MovingLamp(nn.Module):
@@ -67,11 +79,6 @@ class MovingLamp(nn.Module):
 
     def positions(self, origins: Float[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:
         """Where the lamp stands for rays that start at `origins`."""
-        axis = self.axis.expand_as(origins)
-        back = normalize(origins - self.middle, dim=-1)
-        right = normalize(torch.linalg.cross(axis, back), dim=-1)
-        if self.frame == "turntable":
-            back = torch.linalg.cross(right, axis)
-        up = torch.linalg.cross(back, right)
+        right, up, back = moving_axes(origins, self.middle, self.axis, self.frame)
         place = self.first_place + _PACE * self.first_place.norm() * self.change
         return self.middle + place[0] * right + place[1] * up + place[2] * back

@@ -122,7 +122,7 @@ def find_lamp(cameras: Cameras, log_shading: Pictures, hull: Cells, box: SceneBo
 
 def _best_lamp(evidence: _LampEvidence, cameras: Cameras) -> Candidate:
     """The lamp whose light explains most."""
-    middle, axis = _turning_axis(cameras)
+    middle, axis = turning_axis(cameras)
     distance = FIRST_DISTANCE * float(evidence.box.size.max())
     frames: tuple[LampFrame, ...] = ("turntable", "camera")
     kept: list[Lamp] = []
@@ -139,7 +139,7 @@ def _best_lamp(evidence: _LampEvidence, cameras: Cameras) -> Candidate:
     return best
 
 
-def _turning_axis(cameras: Cameras) -> tuple[Triple, Triple]:
+def turning_axis(cameras: Cameras) -> tuple[Triple, Triple]:
     """The point nearest to all lines of sight, and the unit vector upwards to which the cameras' right sides are
     perpendicular."""
     rotations = cameras.camera_to_world[:, :, :3]

@@ -54,6 +54,14 @@ _Markers = Annotated[
 ]
 
 
+class _MovingFrame(msgspec.Struct, kw_only=True, frozen=True):
+    """Axes that turn with the camera about a middle."""
+
+    kind: Annotated[str, Meta(pattern=r"\A(turntable|camera)\Z", description="turntable or camera")]
+    middle: tuple[_Coordinate, _Coordinate, _Coordinate]
+    axis: tuple[_Coordinate, _Coordinate, _Coordinate]
+
+
 class LensKeys(msgspec.Struct, kw_only=True, frozen=True):
     """The lens of a frame, or of the scene for all frames that have none of their own."""
 
@@ -173,6 +181,8 @@ class SceneKeys(msgspec.Struct, kw_only=True, frozen=True):
     environment_exposure_stops: (
         Annotated[float, Meta(ge=-20, le=20, description="a number from -20 to 20")] | None
     ) = None
+    environment_moves: _MovingFrame | None = None
+    """Of light that turns with the camera: the frame in which it stands still."""
     tone_mapping: Any = None
 
 

@@ -61,16 +61,26 @@ class TriangleMesh:
         used, renumbered = np.unique(faces, return_inverse=True)
         return TriangleMesh(self.vertices[used], renumbered.reshape(faces.shape))
 
+    def links(self):  # noqa: ANN201 - a sparse matrix of scipy, which is imported here only
+        """Symmetric matrix (V, V) that is 1 where an edge joins two vertices."""
+        from scipy.sparse import coo_matrix
+
+        edges = self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+        both = np.concatenate([edges, edges[:, ::-1]])
+        count = len(self.vertices)
+        found = coo_matrix((np.ones(len(both)), (both[:, 0], both[:, 1])), shape=(count, count)).tocsr()
+        found.data[:] = 1.0  # an edge counts once, however many faces have it
+        return found
+
     def pieces(self) -> Int64[np.ndarray, " F"]:
         """Number of the piece that each face is of; vertices join faces to one."""
         from scipy.sparse.csgraph import connected_components
 
-        return connected_components(_links(self), directed=False)[1][self.faces[:, 0]].astype(np.int64)
+        return connected_components(self.links(), directed=False)[1][self.faces[:, 0]].astype(np.int64)
 
     def smoothed(self, values: Float[np.ndarray, " V"], rings: int) -> Float64[np.ndarray, " V"]:
         """Numbers of vertices, each replaced as often as `rings` by the mean of itself and its neighbours."""
-        links = _links(self)
-        links.data[:] = 1.0  # an edge counts once, however many faces have it
+        links = self.links()
         counts = 1 + np.asarray(links.sum(axis=1)).ravel()
         for _ in range(rings):
             values = (values + links @ values) / counts
@@ -163,7 +173,7 @@ def surface_of(
         mesh = without_stray_pieces(mesh.select(is_solid[piece]))
 
         is_seen = seen.shows(torch.from_numpy(mesh.vertices).float()).numpy()
-        links = _links(mesh)
+        links = mesh.links()
         for _ in range(_HEALED_RINGS):
             is_seen = is_seen | np.asarray(links @ is_seen.astype(np.float64) > 0)
         shown, areas = np.all(is_seen[mesh.faces], axis=1, keepdims=False), mesh.areas()
@@ -217,13 +227,3 @@ def without_stray_pieces(mesh: TriangleMesh) -> TriangleMesh:
     sizes = np.bincount(piece, minlength=1)
     smallest = max(_SMALLEST_PART * float(sizes.max()), min(_LEAST_FACES, int(sizes.max())))
     return mesh.select(np.asarray(sizes[piece] >= smallest))
-
-
-def _links(mesh: TriangleMesh):  # noqa: ANN202 - a sparse matrix of scipy, which is imported here only
-    """Symmetric matrix (V, V) that is not 0 where an edge joins two vertices."""
-    from scipy.sparse import coo_matrix
-
-    edges = mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    both = np.concatenate([edges, edges[:, ::-1]])
-    count = len(mesh.vertices)
-    return coo_matrix((np.ones(len(both)), (both[:, 0], both[:, 1])), shape=(count, count)).tocsr()

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,11 +23,13 @@ from unmix_plugin.commands.train import train
 from unmix_plugin.engine import load_config
 from unmix_plugin.errors import ConfigError, SceneError
 from unmix_plugin.neumatex.fit.data_manager import ObjectDataManagerConfig
-from unmix_plugin.neumatex.fit.object_scene import LIGHT_UNKNOWN, load_object
+from unmix_plugin.neumatex.fit.object_scene import LIGHT_UNKNOWN, Estimated, load_object
 from unmix_plugin.neumatex.fit.settings import NeumatexModelConfig
 from unmix_plugin.neumatex.from_run.object_folder import ObjectRecipe, object_of_run
+from unmix_plugin.neumatex.tracing.lamp_and_sky import LampAndSky
 from unmix_plugin.scenes.reading.loader import load_scene
-from unmix_plugin.trained.open_run import open_run
+from unmix_plugin.trained.model_scene import LightChoice
+from unmix_plugin.trained.open_run import load_run, open_run
 
 pytestmark = pytest.mark.usefixtures("coarse_hulls")
 
@@ -162,12 +165,60 @@ def test_light_is_estimated_where_none_is_given_and_said_to_be_unknown_where_it_
     assert LIGHT_UNKNOWN not in own.notes
 
 
-def test_a_lamp_that_moves_with_the_camera_is_refused(ball, tmp_path):
-    words = ["--data", ball[0], "--output-dir", tmp_path, *SHORT, "--max-num-iterations", 1]
-    words += ["--light", "camera"]
+def test_light_that_moves_with_the_camera_is_found_in_the_frame_in_which_it_stands_still(ball, tmp_path):
+    scene, _ = ball
+    words = ["--data", scene, "--output-dir", tmp_path, *WORDS, "--light", "camera"]
     run = run_of(done(train, "unmix-nerf", *words))
-    with pytest.raises(ConfigError, match="moves with the camera"):
+    with pytest.raises(ConfigError, match="moves with the camera, and the environment map"):
         object_of_run(ObjectRecipe(run, 400), lambda _: None)
+    (scene / "environment.exr").rename(scene / "elsewhere")
+    try:
+        folder = object_of_run(ObjectRecipe(run, 400), lambda _: None)
+    finally:
+        (scene / "elsewhere").rename(scene / "environment.exr")
+    found = load_object(folder)
+    moves = found.environment.moves
+    assert moves is not None
+    light = next(each for each in found.decisions if each.subject == "light")
+    assert light.evidence["moves with"] == ("the turntable" if moves.kind == "turntable" else "the camera")
+    middle = found.frame.to_world(np.array([moves.middle]))[0]
+    assert np.linalg.norm(middle - CENTRE) < 0.3  # which all cameras look at
+    assert load_object(folder, environment=scene / "environment.exr").environment.moves is None
+    words = ["neumatex", "--data", folder, "--output-dir", tmp_path / "materials", "--max-num-iterations", 1]
+    trained = run_of(
+        done(train, *words, "--pipeline.datamanager.train-num-rays-per-batch", 64, "--device", "cpu")
+    )
+    scene_of_run: Any = load_run(trained, "cpu").scene
+    assert scene_of_run.environment.moves is not None
+    assert scene_of_run.with_light(LightChoice("studio")).environment.moves is None
+    own = scene_of_run.with_light(LightChoice("studio")).with_light(LightChoice(None))
+    assert own.environment.moves == scene_of_run.environment.moves
+
+
+def test_what_was_estimated_may_be_refined_and_what_was_put_in_its_place_may_not(ball, tmp_path):
+    _, run = ball
+    folder = tmp_path / "object"
+    shutil.copytree(object_of_run(ObjectRecipe(run, 500), lambda _: None), folder)
+    assert load_object(folder).estimated == Estimated(has_mesh=True)
+    other_mesh = tmp_path / "other.ply"
+    trimesh.load_mesh(folder / "mesh.ply").export(other_mesh)
+    assert load_object(folder, mesh=other_mesh).estimated == Estimated()
+    light = LampAndSky(torch.tensor([0.0, 0.0, 1.0]), torch.tensor([3.0, 14.0]), torch.ones(2), torch.ones(7))
+    Estimated(light=light).write(folder)
+    found = load_object(folder).estimated
+    assert not found.has_mesh
+    assert found.light is not None
+    assert found.light.to_json() == light.to_json()
+    (folder / "environment.exr").unlink()
+    write_light(folder, 2.0)
+    assert load_object(folder).estimated == Estimated()
+    content = json.loads((folder / "estimated.json").read_text())
+    content["light"]["sky"] = [1.0]
+    Estimated(light=light).write(folder)
+    content["environment"] = json.loads((folder / "estimated.json").read_text())["environment"]
+    (folder / "estimated.json").write_text(json.dumps(content))
+    with pytest.raises(SceneError, match=r"estimated\.json: is damaged"):
+        load_object(folder)
 
 
 def test_damaged_decisions_are_named(tmp_path):

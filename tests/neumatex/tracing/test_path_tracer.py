@@ -9,8 +9,9 @@ from torch.testing import assert_close
 
 from tests.factories.surfaces import Glossy, Lambert, Uniform, ball, generator, mesh_from, unit
 from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.light.lamp import LAMP_FRAMES
 from unmix_plugin.neumatex.tracing.built_in_lights import built_in_environment
-from unmix_plugin.neumatex.tracing.environment import Environment, directions_of_pixels
+from unmix_plugin.neumatex.tracing.environment import Environment, MovingFrame, directions_of_pixels
 from unmix_plugin.neumatex.tracing.microfacet import frames
 from unmix_plugin.neumatex.tracing.path_tracer import TracedObject
 from unmix_plugin.neumatex.tracing.rays import RayMesh, pixel_hits
@@ -241,3 +242,51 @@ def test_a_camera_that_sees_nothing_gives_black_and_alpha_zero():
     traced = TracedObject(_sphere(4), _white(), Uniform(Lambert(), [1.0] * 3))
     picture, alpha = traced.picture(_camera(8, (0.0, -1.0, 0.0), (-1.0, 0.0, 0.0)), 0, 64)
     assert picture.abs().sum() + alpha.sum() == 0
+
+
+@pytest.mark.parametrize("kind", ["turntable", "camera"])
+def test_light_that_turns_with_the_camera_is_that_which_stands_there_for_each_camera(kind):
+    rays, surface = _two_spheres(), Uniform(Glossy(), GLOSSY)
+    towards = unit(torch.tensor([0.5, 0.7, 0.4]))
+    image = (1 + directions_of_pixels(32, 64) @ towards)[..., None].expand(-1, -1, 3) ** 4
+    moving = Environment(image, moves=MovingFrame(kind, (0.1, 0.0, -0.2), (0.1, 0.0, 1.0)))
+    for origin in ((0.3, -3.0, 0.4), (2.0, 1.0, 1.5)):
+        points = _seen(rays, 100, origin)
+        still = moving.seen_from(torch.tensor(origin))
+        found = _radiance(surface, rays, moving, points, 512).mean(dim=0)
+        assert_close(found, _radiance(surface, rays, still, points, 512).mean(dim=0), rtol=0.01, atol=0)
+    first, second = (moving.seen_from(torch.tensor(eye)) for eye in ((0.3, -3.0, 0.4), (2.0, 1.0, 1.5)))
+    assert (first.image - second.image).abs().max() > 0.5
+
+
+def test_a_turntables_light_is_the_same_from_all_heights_and_a_carried_lamp_rises():
+    up = torch.tensor([[0.0, 0.0, 1.0]])
+    for kind, expected in zip(LAMP_FRAMES, (1.0, math.sqrt(0.5)), strict=True):
+        axes = MovingFrame(kind, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)).axes(torch.tensor([[3.0, 0.0, 3.0]]))
+        assert_close(axes @ axes.mT, torch.eye(3)[None])
+        assert float(torch.linalg.det(axes[0])) == pytest.approx(1)
+        assert float(axes[0, 2] @ up[0]) == pytest.approx(expected, abs=1e-6)
+
+
+def test_gradients_to_normals_and_light_are_those_of_differences():
+    """Of the mean over many paths, by the sides of a step; materials that are drawn for themselves included."""
+    rays, surface = _two_spheres(), Uniform(Glossy(), GLOSSY)
+    image = built_in_environment("clear-sky", 3, height=16).image
+    points = _seen(rays, 300)
+    turn = unit(torch.randn(rays.mesh.normals.shape, generator=generator(1)))
+    change = torch.rand(image.shape, generator=generator(2))
+
+    def light(step: torch.Tensor) -> torch.Tensor:
+        turned = rays.with_normals(unit(rays.mesh.normals + step[0] * turn))
+        faces = rays.closest(points.positions + 0.5 * points.to_eye, -points.to_eye)
+        again = turned.points(faces, -points.to_eye)
+        return _radiance(surface, turned, Environment(image + step[1] * change), again, 512).mean()
+
+    at = torch.zeros(2, requires_grad=True)
+    light(at).backward()
+    assert at.grad is not None
+    for row, size in enumerate((0.05, 0.05)):
+        step = torch.zeros(2)
+        step[row] = size
+        difference = float(light(step) - light(-step)) / (2 * size)
+        assert float(at.grad[row]) == pytest.approx(difference, rel=0.1, abs=2e-3)

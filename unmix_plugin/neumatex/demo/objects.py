@@ -17,7 +17,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +32,7 @@ from unmix_plugin.formats.files import rgba_png_bytes, write_file
 from unmix_plugin.formats.meshes import write_glb
 from unmix_plugin.neumatex.demo.surfaces import LayeredSurface, SpectralSurface, demo_mesh, demo_surface
 from unmix_plugin.neumatex.tracing.built_in_lights import built_in_environment
-from unmix_plugin.neumatex.tracing.environment import Environment
+from unmix_plugin.neumatex.tracing.environment import Environment, MovingFrame
 from unmix_plugin.neumatex.tracing.light_files import of_lamp, read_lamp
 from unmix_plugin.neumatex.tracing.mesh import Mesh
 from unmix_plugin.neumatex.tracing.path_tracer import TracedObject
@@ -219,9 +219,11 @@ def write_spectral_object(
     num_bands: int,
     seed: int = 0,
     say: Say = lambda _: None,
+    moves: MovingFrame | None = None,
 ) -> None:
     """Write a spectral object as `write_object` does one in colours; bands lie evenly between 400 and 700 nm, and the
-    seed says of what materials it is."""
+    seed says of what materials it is. `moves`: the frame in which the light of training stands still, where it turns
+    with the camera."""
     bands, ray_mesh = Bands.of(band_centers_nm(num_bands)), RayMesh(mesh)
     surface = SpectralSurface(seed, bands.centers_nm, ray_mesh.mesh.vertices)
     subject = _Subject(ray_mesh, surface, torch.Generator().manual_seed(seed), size)
@@ -230,9 +232,9 @@ def write_spectral_object(
     write_spectra_csv(folder / "endmembers.csv", table)
     places = subject.in_each_light(folder, lights, views, seed, say)
     for number, (place, light, cameras) in enumerate(places):
-        _write_cubes(
-            place, subject, light, cameras, bands, _LAMPS[number % 2], surface if number == 0 else None
-        )
+        light = light if number else replace(light, moves=moves)
+        truth = None if number else surface
+        _write_cubes(place, subject, light, cameras, bands, _LAMPS[number % 2], truth)
 
 
 def _write_cubes(
@@ -248,7 +250,7 @@ def _write_cubes(
     lamp, to_rgb = read_lamp(lamp_name, bands), rgb_matrix(bands)
     light = of_lamp(colours, torch.from_numpy(lamp))
     factor = subject.exposure(light, _SPECTRAL_MEAN_RADIANCE)
-    light, frames = Environment(light.image * factor), list[dict[str, Any]]()
+    light, frames = replace(light, image=light.image * factor), list[dict[str, Any]]()
     splits: dict[str, list[str]] = {"train_filenames": [], "val_filenames": []}
     for index in range(len(cameras)):
         is_training = truth is not None and index % _EVALUATION_INTERVAL
@@ -271,6 +273,9 @@ def _write_cubes(
         "tone_mapping": "linear",
         "value_scale": 1.0,
     }
+    if light.moves is not None:
+        kind, middle, axis = light.moves.kind, light.moves.middle, light.moves.axis
+        content["environment_moves"] = {"kind": kind, "middle": list(middle), "axis": list(axis)}
     if truth is not None:
         content |= {
             "mesh_path": "mesh.glb",

@@ -174,6 +174,8 @@ class ObjectDataManager(DataManager):
         mesh, light = self.object.mesh, self.object.environment
         arrays = {"vertices": mesh.vertices, "faces": mesh.faces, "normals": mesh.normals, "uv": mesh.uv}
         arrays["light_map"] = light.image
+        estimated = self.object.estimated.light
+        arrays["lamp_and_sky"] = None if estimated is None else estimated.to_tensor()
         buffers = {name: array.numpy() for name, array in arrays.items() if array is not None}
         return buffers | (view_arrays(self.object) if self.object.lamp is None else self._pixel_arrays())
 

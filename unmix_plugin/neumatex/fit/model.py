@@ -26,11 +26,13 @@ from torch import Tensor, nn
 from unmix_plugin.engine import Cameras, Model, RayBundle, TrainingCallback, TrainingCallbackLocation
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.neumatex.fit.evaluation import evaluate_object_image, evaluation_outputs
+from unmix_plugin.neumatex.fit.refinement import FittedLight, FittedNormals
 from unmix_plugin.neumatex.fit.settings import NeumatexModelConfig, ObjectRecord
 from unmix_plugin.neumatex.fit.start import fit_abundances, spectral_start, start_plain, views_of
 from unmix_plugin.neumatex.fit.tone import LampRatio, SpectralDisplay, ToneMapping, psnr_db, tone_curve
-from unmix_plugin.neumatex.tracing.environment import Environment
+from unmix_plugin.neumatex.tracing.environment import Environment, MovingFrame
 from unmix_plugin.neumatex.tracing.families import PbrFamily, SpectralFamily
+from unmix_plugin.neumatex.tracing.lamp_and_sky import LampAndSky
 from unmix_plugin.neumatex.tracing.mesh import Mesh
 from unmix_plugin.neumatex.tracing.neural import NeuralFamily
 from unmix_plugin.neumatex.tracing.path_tracer import TracedObject
@@ -76,12 +78,17 @@ class NeumatexModel(Model):
             self.curve = SpectralDisplay(record.bands)
         for name, buffer in _empty_buffers(record).items():
             self.register_buffer(name, buffer)
-        self._traced: tuple[TracedObject, Tensor, int] | None = None
+        refine = self.config.refine
+        self.light = FittedLight() if refine and record.has_estimated_light else None
+        self.relief = FittedNormals(record.num_vertices) if refine and record.has_estimated_mesh else None
+        self._tree: tuple[RayMesh, Tensor, int] | None = None
 
     def initialise(self, initial_data: Mapping[str, np.ndarray], generator: torch.Generator) -> None:
         """Take mesh and environment over, and begin with the prior's material, or a plain one."""
         for name in _empty_buffers(self.record):
             self.get_buffer(name).copy_(torch.from_numpy(initial_data[name]))
+        if self.light is not None:
+            self.light.start_from(LampAndSky.from_tensor(torch.from_numpy(initial_data["lamp_and_sky"])))
         if self.endmembers is not None:
             start = spectral_start(
                 self.traced,
@@ -105,7 +112,7 @@ class NeumatexModel(Model):
             found = predict(
                 views_of(initial_data),
                 self.traced.ray_mesh,
-                self.environment,
+                self.traced.environment,
                 self.config.material,
                 resolution=self.config.plane_resolution,
                 generator=generator,
@@ -114,13 +121,16 @@ class NeumatexModel(Model):
             self.prior.load_state_dict(found.state_dict())
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
-        """Planes, networks unless they stay as they are, and the camera's response where there is one."""
+        """Planes, networks unless they stay as they are, the camera's response where there is one, and what of the
+        object was estimated."""
         return {
             "planes": [self.triplane.planes],
             "networks": [*self.triplane.readers.parameters()] if self.config.fit_networks else [],
             "response": [*self.curve.parameters()],
             "endmembers": [] if self.endmembers is None else [self.endmembers],
             "gains": [] if self.gains is None else [self.gains],
+            "light": [] if self.light is None else [*self.light.parameters()],
+            "normals": [] if self.relief is None else [*self.relief.parameters()],
         }
 
     def get_training_callbacks(self) -> list[TrainingCallback]:
@@ -139,15 +149,9 @@ class NeumatexModel(Model):
 
     @property
     def mesh(self) -> Mesh:
-        """In model space."""
+        """In model space, with the normals that it was given."""
         uv = self.get_buffer("uv") if self.record.has_uv else None
         return Mesh(self.get_buffer("vertices"), self.get_buffer("faces"), self.get_buffer("normals"), uv)
-
-    @property
-    def environment(self) -> Environment:
-        """The light of the pictures."""
-        record = self.record
-        return Environment(self.get_buffer("light_map"), record.rotation_deg, record.exposure_stops)
 
     @property
     def surface(self) -> TriplaneSurface:
@@ -156,12 +160,25 @@ class NeumatexModel(Model):
 
     @property
     def traced(self) -> TracedObject:
-        """Mesh, light and materials, ready for rays; kept while the vertices stay as they are."""
+        """Mesh, light and materials, ready for rays."""
+        return self.traced_with(self.light, self.relief)
+
+    def traced_with(self, light: FittedLight | None, relief: FittedNormals | None) -> TracedObject:
+        """The same with copies of what is fitted of light and mesh; the tree over triangles is kept while the vertices
+        stay as they are."""
         vertices = self.get_buffer("vertices")
-        if self._traced is None or self._traced[1] is not vertices or self._traced[2] != vertices._version:
-            traced = TracedObject(RayMesh(self.mesh, vertices.device), self.environment, self.surface)
-            self._traced = traced, vertices, vertices._version
-        return self._traced[0]
+        if self._tree is None or self._tree[1] is not vertices or self._tree[2] != vertices._version:
+            self._tree = RayMesh(self.mesh, vertices.device), vertices, vertices._version
+        ray_mesh = self._tree[0]
+        if relief is not None:
+            ray_mesh = ray_mesh.with_normals(relief(self.get_buffer("normals"), self.get_buffer("faces")))
+        record = self.record
+        moves = MovingFrame.of_numbers(record.moving_frame) if record.moving_frame else None
+        image, placement = self.get_buffer("light_map"), (record.rotation_deg, record.exposure_stops)
+        if light is not None:
+            image, placement = light.light().radiance() * image.new_tensor(record.lamp), (0.0, 0.0)
+        environment = Environment(image, *placement, moves)
+        return TracedObject(ray_mesh, environment, self.surface)
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Tensor]:
         """Two independent estimates of the light along the rays, `halves` (2, R, C); which rays meet the mesh, `found`

@@ -12,7 +12,7 @@ Notation: `H x W` pixels, `B` bands, `M` true materials.
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
 
@@ -21,13 +21,14 @@ from jaxtyping import Float64
 
 from unmix_plugin.engine import Decision
 from unmix_plugin.errors import SceneError
-from unmix_plugin.formats.files import hash_of
+from unmix_plugin.formats.files import hash_of, write_file
 from unmix_plugin.formats.json_values import describe
 from unmix_plugin.limits import MOST_TEXT_BYTES, read_bounded
 from unmix_plugin.neumatex.fit import checks
 from unmix_plugin.neumatex.fit.pictures import PosedPictures, read_picture, read_posed_pictures
 from unmix_plugin.neumatex.fit.tone import TONE_MAPPINGS, ToneMapping
-from unmix_plugin.neumatex.tracing.environment import Environment
+from unmix_plugin.neumatex.tracing.environment import Environment, MovingFrame
+from unmix_plugin.neumatex.tracing.lamp_and_sky import LampAndSky
 from unmix_plugin.neumatex.tracing.light_files import ENVIRONMENT_SUFFIXES, read_environment, read_lamp
 from unmix_plugin.neumatex.tracing.mesh import MESH_SUFFIXES, Mesh, read_mesh, turned_to_viewers
 from unmix_plugin.neumatex.tracing.rays import RayMesh
@@ -95,6 +96,7 @@ class ObjectScene:
     """What is unusual but usable."""
     decisions: tuple[Decision, ...]
     """What was decided when it was made of a run."""
+    estimated: Estimated
 
     def truth(self, index: int) -> dict[str, np.ndarray]:
         """What is known of a view's materials, float32: `base_colour` (H W 3), linear; or of spectral pictures
@@ -173,6 +175,8 @@ def load_object(
         )
     power = folder.lamp(bands) if bands is None or lamp is None else read_lamp(lamp, bands)
     light = folder.environment(bands, power)
+    if environment is None:  # which stands still
+        light = replace(light, moves=folder.moving_frame(frame, bands))
     notes += checks.light_doubts(pictures, light)
     hashes = [pictures.hashes[name] for name in pictures.names]
     poses = pictures.cameras.camera_to_world.numpy()
@@ -209,6 +213,7 @@ def load_object(
         input_hashes={**{path.name: hash_of(path) for path in files}, **pictures.hashes},
         notes=tuple(notes),
         decisions=decisions,
+        estimated=read_estimated(root, *files),
     )
     for view in scene.split.evaluation:  # a malformed truth is told before training, not after it
         scene.truth(view)
@@ -239,6 +244,43 @@ def read_decisions(root: Path) -> tuple[Decision, ...]:
 
 
 @dataclass(frozen=True)
+class Estimated:
+    """What of an object was not given but told by its pictures, so that a fit may refine it."""
+
+    has_mesh: bool = False
+    light: LampAndSky | None = None
+    """As which the environment was written."""
+
+    def write(self, root: Path) -> None:
+        """Beside mesh.ply and environment.exr, whose content is noted: another one is no estimate."""
+        content = {
+            "mesh": hash_of(root / "mesh.ply") if self.has_mesh else None,
+            "environment": None if self.light is None else hash_of(root / "environment.exr"),
+            "light": None if self.light is None else self.light.to_json(),
+        }
+        write_file(root / _ESTIMATED_FILE, json.dumps(content, indent=1).encode())
+
+
+_ESTIMATED_FILE = "estimated.json"
+
+
+def read_estimated(root: Path, mesh: Path, environment: Path) -> Estimated:
+    """What `Estimated.write` noted, of these files; nothing where there is none."""
+    path = root / _ESTIMATED_FILE
+    if not path.is_file():
+        return Estimated()
+    try:
+        content = json.loads(read_bounded(path, MOST_TEXT_BYTES))
+        has_mesh = content["mesh"] is not None and content["mesh"] == hash_of(mesh)
+        has_light = content["environment"] is not None and content["environment"] == hash_of(environment)
+        return Estimated(has_mesh, LampAndSky.from_json(content["light"]) if has_light else None)
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise SceneError(
+            f"{path}: is damaged ({error}); make the object again, or remove the file"
+        ) from error
+
+
+@dataclass(frozen=True)
 class _Folder:
     """What a folder's transforms.json says."""
 
@@ -259,6 +301,18 @@ class _Folder:
     def environment(self, bands: Bands | None, lamp: _Lamp | None) -> Environment:
         """In the bands of spectral pictures, otherwise in colours."""
         return read_environment(self.environment_path, *self.placement, bands=bands, lamp=lamp)
+
+    def moving_frame(self, frame: Normalisation, bands: Bands | None) -> MovingFrame | None:
+        """What 'environment_moves' says, in model space; None where the light stands still."""
+        keys = self.entry.keys.environment_moves
+        if keys is None:
+            return None
+        if bands is None or not any(keys.axis):
+            what = "for pictures in colours; it needs pictures of many bands"
+            what = what if bands is None else "with an axis of no length"
+            raise SceneError(f"{self.root / FILE_NAME}: 'environment_moves' {what}")
+        middle = frame.to_model(np.array([keys.middle]))[0].tolist()
+        return MovingFrame.of_numbers((float(keys.kind == "camera"), *middle, *keys.axis))
 
     def lamp(self, bands: Bands | None) -> Float64[np.ndarray, " B"] | None:
         """What 'illuminant_path' names, for spectral pictures; None where there is none."""
@@ -441,6 +495,8 @@ def _read_held_out(
         expected = f"{_NUM_COLOURS} colours" if bands is None else bands
         raise SceneError(f"{root}: pictures of {found}; the object has {expected}: give the same")
     own_lamp = folder.lamp(bands)
+    if folder.entry.keys.environment_moves is not None:
+        raise SceneError(f"{root / FILE_NAME}: 'environment_moves'; lights of relit/ stand still")
     return HeldOutLight(
         root.name, folder.environment(bands, lamp if own_lamp is None else own_lamp), pictures
     )

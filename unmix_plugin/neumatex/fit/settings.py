@@ -49,6 +49,8 @@ class ObjectRecord:
     """Of the environment about +z."""
     exposure_stops: float = 0.0
     """Of the environment."""
+    moving_frame: tuple[float, ...] = ()
+    """`MovingFrame.numbers` in model space, where the light turns with the camera; empty where it stands still."""
     num_colours: int = 3
     """Of the pictures."""
     tone_mapping: ToneMapping = "linear"
@@ -57,6 +59,10 @@ class ObjectRecord:
     """Of spectral pictures; empty for RGB."""
     lamp: tuple[float, ...] = ()
     """Relative power of the light of spectral pictures, greatest band 1; empty for RGB."""
+    has_estimated_mesh: bool = False
+    """Whether the mesh was made of a run: its normals can be fitted."""
+    has_estimated_light: bool = False
+    """Whether the environment is a `LampAndSky` that shading told: it can be fitted."""
 
     @property
     def is_spectral(self) -> bool:
@@ -81,10 +87,13 @@ class ObjectRecord:
             num_light_colours=light_colours,
             rotation_deg=light.rotation_deg,
             exposure_stops=light.exposure_stops,
+            moving_frame=() if light.moves is None else light.moves.numbers(),
             num_colours=scene.pictures.num_colours,
             tone_mapping=scene.pictures.tone,
             wavelengths_nm=() if scene.bands is None else tuple(scene.bands.centers_nm.tolist()),
             lamp=() if scene.lamp is None else tuple(scene.lamp.tolist()),
+            has_estimated_mesh=scene.estimated.has_mesh,
+            has_estimated_light=scene.estimated.light is not None,
         )
 
     def to_json(self) -> dict[str, Any]:
@@ -100,6 +109,8 @@ class ObjectRecord:
         counts = (record.num_vertices, record.num_faces, *record.environment_size, record.num_colours)
         if min(*counts, record.num_light_colours) < 1:
             raise ValueError(f"an object needs sizes of at least 1; found {counts}")
+        if len(record.moving_frame) not in (0, 7):
+            raise ValueError(f"a moving frame has seven numbers; found {len(record.moving_frame)}")
         if record.is_spectral and {len(record.lamp), len(record.wavelengths_nm)} != {record.num_colours}:
             raise ValueError(
                 f"an object of {record.num_colours} bands needs as many wavelengths and powers of its lamp; found "
@@ -142,6 +153,9 @@ class NeumatexModelConfig(ModelConfig):
     prior: Annotated[PriorName, CommonFlag] = "small"
     """Where the fit starts and what it is held to: small is the prior of the package; none starts from a plain grey
     material. Spectral materials have no prior: they start from the pictures or from a run."""
+    refine: Annotated[bool, CommonFlag] = True
+    """Fit what --from-run estimated together with the materials: the light, and the normals of the mesh. What is given
+    stays as it is."""
     fit_networks: bool = True
     """Fit the networks that read the planes, too. Published with a prior: the planes alone."""
     regularisation: Annotated[float, Within("[0, inf)")] = 1e-5

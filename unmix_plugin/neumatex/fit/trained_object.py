@@ -206,7 +206,7 @@ class TrainedObject:
         own = self.own_light or self.environment
         light = own if choice.name in (None, OWN_LIGHT) else self._named_light(str(choice.name))
         angle, stops = light.rotation_deg + choice.rotation_deg, light.exposure_stops + choice.exposure_stops
-        turned = Environment(light.image.to(self.device), angle, stops)
+        turned = Environment(light.image.to(self.device), angle, stops, light.moves)
         return replace(self, environment=turned, own_light=own)
 
     def _named_light(self, name: str) -> Environment:
@@ -261,7 +261,7 @@ class TrainedObject:
         from unmix_plugin.neumatex.export.page import ObjectForPage, page_content
 
         view = next((view for view in self.views if view.split == "eval"), self.views[0])
-        seen = self.look(view.camera)
+        seen, eye = self.look(view.camera), view.camera.camera_to_world[0, :, 3].to(self.device)
         base_colour = linear_to_srgb(seen["base_colour"].clamp(0, 1))
         shown = ObjectForPage(
             mesh=self.mesh,
@@ -269,7 +269,9 @@ class TrainedObject:
             bands=self.bands,
             curve=self.curve,
             frame=self.frame,
-            lights={name: self.with_light(LightChoice(name)).environment for name in self.lights},
+            lights={
+                name: self.with_light(LightChoice(name)).environment.seen_from(eye) for name in self.lights
+            },
             pictures={f"{view.name}, in colour": seen["rgb"], f"{view.name}, base colour": base_colour},
         )
         return page_content(shown, resolution)
@@ -349,10 +351,13 @@ def trained_object(
     triplane = copy.deepcopy(model.triplane, dict(frozen))  # type: ignore[arg-type]
     curve = copy.deepcopy(model.curve, dict(frozen))  # type: ignore[arg-type]
     family = copy.deepcopy(model.family, dict(frozen))  # type: ignore[arg-type]
+    with torch.no_grad():
+        light, relief = copy.deepcopy((model.light, model.relief), dict(frozen))  # type: ignore[arg-type]
+        traced = model.traced_with(light, relief)
     return TrainedObject(
-        model.traced.ray_mesh,
+        traced.ray_mesh,
         replace(model.surface, family=family, triplane=triplane),
-        model.environment,
+        traced.environment,
         world_frame(record),
         recorded_views(record),
         record.scene_box,

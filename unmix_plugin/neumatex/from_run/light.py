@@ -29,16 +29,20 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from unmix_plugin.engine import UNDECIDED, Decision
-from unmix_plugin.neumatex.tracing.environment import Environment, directions_of_pixels, solid_angles
+from unmix_plugin.neumatex.tracing.lamp_and_sky import (
+    NUM_PATCHES,
+    SHARP_DEG,
+    SOFT_DEG,
+    LampAndSky,
+    sky_patches,
+)
+from unmix_plugin.neumatex.tracing.microfacet import to_local, to_world
 from unmix_plugin.neumatex.tracing.rays import RayMesh, SurfacePoints
 
 _NUM_DIRECTIONS = 384
 """Of the first search: 10 degrees apart."""
 _FINER = ((8.0, 48), (2.5, 48))
 """Half angles of the cones of the next searches, degrees, and how many directions they have."""
-_SOFT_DEG, _SHARP_DEG = 14.0, 3.0
-"""Standard deviation of a soft lamp, such as a softbox or the glow about the sun; radius of a sharp one."""
-_PATCHES = 7
 _ROUNDS = 8
 """In which light and gains are fitted in turn: with 3, a low sun left materials on its far side 20 % too bright."""
 _HIGHLIGHTS = 2.5
@@ -50,8 +54,6 @@ _LEAST_SHARE = 0.12
 _CLEARLY_WORSE = 1.02
 """Squared error of lamps more than `_ELSEWHERE_DEG` away over that of the best, from which they are ruled out."""
 _ELSEWHERE_DEG = 40.0
-_HEIGHT = 64
-"""Rows of the environment."""
 _WHITE = 0.95
 """Reflectance of what is as bright as surfaces get."""
 
@@ -66,18 +68,22 @@ class LitPoints:
     """Radiance towards the eye."""
     abundances: Float[Tensor, "N K"]
     """Summing to 1."""
+    light_axes: Float[Tensor, "N 3 3"] | None = None
+    """Rows are the axes in which the light stands still, as seen from each point's camera; None: those of the world."""
 
 
 @dataclass(frozen=True)
 class FoundLight:
     """The light of an object, and how it was decided."""
 
-    environment: Environment
-    """World directions, one number: relative to the lamp's spectrum."""
+    light: LampAndSky
+    """World directions; relative to the lamp's spectrum."""
     direction: Float64[np.ndarray, "3"] | None
-    """Unit vector to the lamp in the world; None where no direction is believed."""
+    """Unit vector to the lamp in the axes of the light; None where no direction is believed."""
     gains: Float64[np.ndarray, " K"]
     """By which each endmember's reflectance is brighter than it was given."""
+    error: float
+    """Mean squared error of the shading that is left."""
     decision: Decision
 
 
@@ -101,12 +107,12 @@ def find_light(
     seen = lit.spectra / lamp
     wide = _fibonacci(_NUM_DIRECTIONS)
     arriving = _arriving(ray_mesh, lit, wide)
-    patches = _patches(wide)
+    patches = sky_patches(wide)
     sky = arriving @ patches * (4 / _NUM_DIRECTIONS)  # solid angle of a direction over pi
     gains = torch.ones(len(reflectances), dtype=torch.float64)
     weights = torch.ones(len(seen), dtype=torch.float64)
     softened = arriving @ _soft(wide, wide)
-    fits, best, alone, elsewhere = [_Fit(np.zeros(_PATCHES + 2), math.inf)], wide[0], math.inf, math.inf
+    fits, best, alone, elsewhere = [_Fit(np.zeros(NUM_PATCHES + 2), math.inf)], wide[0], math.inf, math.inf
     chosen, mixed, shade, trust = 0, lit.abundances.double(), weights, weights
     for number in range(_ROUNDS):
         mixed = lit.abundances.double() @ (gains[:, None] * reflectances.double())
@@ -133,7 +139,7 @@ def find_light(
             weights = (_HIGHLIGHTS * usual / off.clamp(min=1e-9)).clamp(max=1)
             gains = _gains(lit.abundances, reflectances, light, seen, weights)
     fit = fits[chosen]
-    share = float(fit.values[_PATCHES:].sum() / max(fit.values.sum(), 1e-12))
+    share = float(fit.values[NUM_PATCHES:].sum() / max(fit.values.sum(), 1e-12))
     is_better = fit.error < (1 - _LEAST_GAIN) * alone and elsewhere > _CLEARLY_WORSE * fit.error
     is_believed = is_better and share > _LEAST_SHARE
     evidence: dict[str, float | int | bool | str] = {
@@ -146,16 +152,20 @@ def find_light(
         fit = _Fit(np.append(fit.values, [0.0, 0.0]), fit.error)
     towards = best.double().numpy()
     scale, assumed = _scale(fit, patches, wide, best, mixed, white)
-    environment = Environment((scale * _radiance(fit, best)).float()[..., None])
+    lamp, sky = (
+        torch.from_numpy(scale * part).float()
+        for part in (fit.values[NUM_PATCHES:], fit.values[:NUM_PATCHES])
+    )
+    found = LampAndSky(best.float(), torch.tensor([SHARP_DEG, SOFT_DEG]), lamp, sky)
     evidence["brightness of white"] = "assumed" if assumed else "by the white reference"
     decision = Decision(
         "light",
-        f"a lamp at {_place(towards)}, and sky" if is_believed else UNDECIDED,
+        f"a lamp at {_place(towards, lit.light_axes is not None)}, and sky" if is_believed else UNDECIDED,
         evidence,
         "a sky alone that explains shading and shadows nearly as well, or a lamp elsewhere that does",
         "--environment",
     )
-    return FoundLight(environment, towards if is_believed else None, (gains / scale).numpy(), decision)
+    return FoundLight(found, towards if is_believed else None, (gains / scale).numpy(), fit.error, decision)
 
 
 @dataclass(frozen=True)
@@ -226,11 +236,15 @@ def _gains(
 
 
 def _arriving(ray_mesh: RayMesh, lit: LitPoints, directions: Float[Tensor, "D 3"]) -> Float[Tensor, "N D"]:
-    """Cosines of directions of the world at points, 0 where the mesh is in the way."""
-    points = lit.points
-    cosines = (points.normals @ directions.T).clamp(min=0) * (points.geometric_normals @ directions.T > 0)
+    """Cosines of directions of the light at points, 0 where the mesh is in the way."""
+    points, axes = lit.points, lit.light_axes
+    normals, geometric = points.normals, points.geometric_normals
+    if axes is not None:
+        normals, geometric = to_local(axes, normals), to_local(axes, geometric)
+    cosines = (normals @ directions.T).clamp(min=0) * (geometric @ directions.T > 0)
     rows, columns = (cosines > 0).nonzero(as_tuple=True)
-    cosines[rows, columns] *= ~ray_mesh.blocked(points.positions[rows], directions[columns])
+    towards = directions[columns] if axes is None else to_world(axes[rows], directions[columns])
+    cosines[rows, columns] *= ~ray_mesh.blocked(points.positions[rows], towards)
     return cosines
 
 
@@ -253,32 +267,11 @@ def _cone(axis: Float[Tensor, "3"], half_angle_deg: float, count: int) -> Float[
     return normalize(axis.double() + offsets, dim=1).float()
 
 
-def _patches(directions: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n M"]:
-    """Radiance of each patch of sky: even light, then the cosines to both ends of each axis."""
-    both = torch.cat([directions, -directions], dim=-1).clamp(min=0)
-    return torch.cat([torch.ones_like(both[..., :1]), both], dim=-1)
-
-
 def _soft(directions: Float[Tensor, "D 3"], towards: Float[Tensor, "n 3"]) -> Float[Tensor, "D n"]:
     """Parts of soft lamps' light from each direction, summing to 1 for each lamp."""
-    sharpness = 1 / math.radians(_SOFT_DEG) ** 2
+    sharpness = 1 / math.radians(SOFT_DEG) ** 2
     lobes = (sharpness * (directions @ towards.T - 1)).exp()
     return lobes / lobes.sum(dim=0)
-
-
-def _radiance(fit: _Fit, towards: Float[Tensor, "3"]) -> Float64[Tensor, "H W"]:
-    """Of every direction of the world."""
-    directions = directions_of_pixels(_HEIGHT, 2 * _HEIGHT)
-    angles = solid_angles(_HEIGHT, 2 * _HEIGHT)[:, None]
-    sky = _patches(directions).double() @ torch.from_numpy(fit.values[:_PATCHES])
-    cosines = (directions @ towards).double()
-    edge = math.cos(math.radians(max(_SHARP_DEG, 0.75 * 180 / _HEIGHT)))
-    disc = (cosines > edge).double()
-    lobe = ((cosines - 1) / math.radians(_SOFT_DEG) ** 2).exp()
-    for shape, value in ((disc, fit.values[_PATCHES]), (lobe, fit.values[_PATCHES + 1])):
-        # A white surface sends back what arrives over pi.
-        sky = sky + value * math.pi * shape / (shape * angles * cosines.clamp(min=0)).sum()
-    return sky
 
 
 def _scale(
@@ -291,14 +284,17 @@ def _scale(
 ) -> tuple[float, bool]:
     """Factor of the light, by which reflectances are divided, and whether it is assumed."""
     cosines = (wide @ wide.T).clamp(min=0)
-    reads = (cosines @ patches).double() @ torch.from_numpy(fit.values[:_PATCHES]) * (4 / len(wide))
-    lamps = float(fit.values[_PATCHES:].sum())
+    reads = (cosines @ patches).double() @ torch.from_numpy(fit.values[:NUM_PATCHES]) * (4 / len(wide))
+    lamps = float(fit.values[NUM_PATCHES:].sum())
     reads = reads + lamps * (wide @ towards).clamp(min=0)
     wanted = (1.0 if white is None else white) / float(reads.max())
     brightest = float(mixed.mean(dim=1).quantile(0.99))
     return max(wanted, brightest / _WHITE) if white is None else wanted, white is None
 
 
-def _place(towards: Float64[np.ndarray, "3"]) -> str:
+def _place(towards: Float64[np.ndarray, "3"], moves: bool) -> str:
     azimuth, elevation = math.degrees(math.atan2(towards[1], towards[0])), math.degrees(math.asin(towards[2]))
+    if moves:
+        side = "right" if azimuth > 0 else "left"
+        return f"{abs(azimuth):.0f} degrees to the camera's {side}, elevation {elevation:.0f} degrees"
     return f"azimuth {azimuth:.0f} degrees, elevation {elevation:.0f} degrees"

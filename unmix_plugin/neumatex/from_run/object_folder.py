@@ -32,11 +32,20 @@ from unmix_plugin.errors import ConfigError, SceneError
 from unmix_plugin.formats.exr import write_spectral_exr
 from unmix_plugin.formats.files import hash_of, make_folder, safe_name, write_file
 from unmix_plugin.formats.meshes import write_ply
+from unmix_plugin.light.lamp import LAMP_FRAMES
+from unmix_plugin.light.search import turning_axis
 from unmix_plugin.neumatex.fit.data_manager import ObjectDataManagerConfig, PixelList
-from unmix_plugin.neumatex.fit.object_scene import DECISIONS_FILE, LIGHT_UNKNOWN, load_posed_object
+from unmix_plugin.neumatex.fit.object_scene import (
+    DECISIONS_FILE,
+    LIGHT_UNKNOWN,
+    Estimated,
+    load_posed_object,
+)
 from unmix_plugin.neumatex.fit.settings import NeumatexModelConfig
 from unmix_plugin.neumatex.fit.start import RunMaterials
 from unmix_plugin.neumatex.from_run.light import LitPoints, find_light
+from unmix_plugin.neumatex.tracing.environment import MovingFrame
+from unmix_plugin.neumatex.tracing.lamp_and_sky import LampAndSky
 from unmix_plugin.neumatex.tracing.light_files import ENVIRONMENT_SUFFIXES, read_lamp
 from unmix_plugin.neumatex.tracing.rays import RayMesh
 from unmix_plugin.scenes.demo.scene import written_once
@@ -53,7 +62,7 @@ from unmix_plugin.trained.surface_mesh import TriangleMesh, surface_of
 
 _NUM_POINTS, _MOST_PIXELS, _SEED = 5000, 2_000_000, 0
 """Pixels that the light is found from, and of how many they are drawn."""
-_RECIPE_FILE, _VERSION = "made_of.json", 2
+_RECIPE_FILE, _VERSION = "made_of.json", 3
 """What a folder was made of, written last; the version of how."""
 _MOST_UNSEEN = 0.02
 """Part of the surface that no camera sees, from which that is worth a word."""
@@ -93,7 +102,8 @@ def object_of_run(recipe: ObjectRecipe, say: Say) -> Path:
 
     Raises:
         RunError: the run is unusable, or has no surface.
-        ConfigError: the run has no mixed materials, several sensors, or light that moves with the camera.
+        ConfigError: the run has no mixed materials, or several sensors; its light moves with the camera beside a map
+            that stands still.
         SceneError: its scene is gone or has changed, or the folder can't be written.
     """
     for path in (recipe.mesh, recipe.environment):
@@ -133,16 +143,25 @@ def _write_object(folder: Path, recipe: ObjectRecipe, loaded: LoadedRun, say: Sa
             f"{recipe.run}: its pictures are of several sensors or sizes, and an object needs cubes of all bands; "
             "train unmix-nerf on those of one sensor"
         )
-    if recipe.environment is None:
-        _refuse_moving_lamp(recipe, loaded)
     content = _write_pictures(folder, recipe, loaded, scene, say)
     decisions = list[Decision]()
     if recipe.mesh is None:
         decisions.append(_write_mesh(folder, recipe, loaded, say))
     environment = {} if recipe.environment is not None else _copied_environment(folder, scene)
+    if environment and _moves_with_camera(loaded):
+        raise ConfigError(
+            f"{recipe.run}: its light moves with the camera, and the environment map of the scene's folder stands "
+            "still; take the map away, or train the run with --light fixed if the light did stand still"
+        )
     (folder / FILE_NAME).write_bytes(transforms_bytes({**content, **environment}))
+    estimated = Estimated(has_mesh=recipe.mesh is None)
     if recipe.environment is None and not environment:
-        decisions.append(_write_light(folder, recipe, loaded, _white(scene), say))
+        decision, light, moves = _write_light(folder, recipe, loaded, _white(scene), say)
+        decisions.append(decision)
+        estimated = replace(estimated, light=light)
+        if moves is not None:
+            (folder / FILE_NAME).write_bytes(transforms_bytes({**content, "environment_moves": moves}))
+    estimated.write(folder)
     write_file(folder / DECISIONS_FILE, json.dumps([each.to_json() for each in decisions], indent=1).encode())
 
 
@@ -269,15 +288,10 @@ def _write_mesh(folder: Path, recipe: ObjectRecipe, loaded: LoadedRun, say: Say)
     )
 
 
-def _refuse_moving_lamp(recipe: ObjectRecipe, loaded: LoadedRun) -> None:
-    """Raise ConfigError where the run's light moves with the camera: a map of the world can't."""
+def _moves_with_camera(loaded: LoadedRun) -> bool:
+    """Whether the run's light moves with the camera, or the object was turned before a lamp."""
     model = loaded.config.pipeline.model
-    if isinstance(model, UnmixModelConfig) and model.light == "camera":
-        raise ConfigError(
-            f"{recipe.run}: its light moves with the camera, or the object was turned before a lamp, and neumatex "
-            "takes light that stands still as seen from the object; capture it with a lamp that does, or if the light "
-            "did stand still train the run with --light fixed"
-        )
+    return isinstance(model, UnmixModelConfig) and model.light == "camera"
 
 
 def _white(scene: Scene) -> float | None:
@@ -288,36 +302,56 @@ def _white(scene: Scene) -> float | None:
 
 def _write_light(
     folder: Path, recipe: ObjectRecipe, loaded: LoadedRun, white: float | None, say: Say
-) -> Decision:
-    """The light that shading and shadows on the mesh tell, as an environment map of all bands."""
+) -> tuple[Decision, LampAndSky | None, dict[str, Any] | None]:
+    """The light that shading and shadows on the mesh tell, as an environment map of all bands; None: no lamp is
+    believed. And, where it moves with the camera, in which frame of the world it stands still, as a key has it."""
     say("looking for its light ...")
     known = load_posed_object(folder, recipe.mesh)
     assert known.bands is not None
     lamp = np.ones(len(known.bands)) if known.lamp is None else known.lamp
     generator = torch.Generator().manual_seed(_SEED)
     views, places, spectra = PixelList(known, _MOST_PIXELS, _SEED).draw(_NUM_POINTS, generator)
-    rays = known.pictures.cameras[list(known.split.train)].generate_rays(views, places)
+    cameras = known.pictures.cameras[list(known.split.train)]
+    rays = cameras.generate_rays(views, places)
     ray_mesh = RayMesh(known.mesh)
     found, points = ray_mesh.seen(rays.origins, rays.directions)
     run = RunMaterials(recipe.run, loaded.materials_scene)
     corners = known.frame.to_world(np.concatenate([np.zeros((1, 3)), np.eye(3)]))
     abundances = run.abundances(points.positions, points.geometric_normals, corners)
     reflectances = run.reflectances(known.bands, lamp, abundances.shape[1])
-    lit = LitPoints(points, spectra[found], abundances)
-    light = find_light(ray_mesh, lit, reflectances, torch.from_numpy(lamp).float(), white)
-    radiance = light.environment.image.numpy() * lamp.astype(np.float32)
-    about = (
-        "light of an object as shading and shadows on its mesh tell it; +z is the top, +x the middle column"
-    )
+    frames: list[MovingFrame | None] = [None]
+    if _moves_with_camera(loaded):
+        middle, axis = turning_axis(cameras)
+        frames = [MovingFrame(kind, middle, axis) for kind in LAMP_FRAMES]
+    lights = []
+    for frame in frames:
+        axes = None if frame is None else frame.axes(rays.origins[found])
+        lit = LitPoints(points, spectra[found], abundances, axes)
+        lights.append(find_light(ray_mesh, lit, reflectances, torch.from_numpy(lamp).float(), white))
+    chosen = min(range(len(lights)), key=lambda number: lights[number].error)
+    light, moves = lights[chosen], frames[chosen]
+    radiance = light.light.radiance().numpy() * lamp.astype(np.float32)
+    axes_of_map = "+z is the top, +x the middle column"
+    if moves is not None:
+        axes_of_map += "; x is towards the camera, y to its right, see environment_moves in transforms.json"
+    about = f"light of an object as shading and shadows on its mesh tell it; {axes_of_map}"
     write_spectral_exr(folder / "environment.exr", radiance, known.bands, None, comments=about)
-    spectrum = (
+    evidence = dict(light.decision.evidence)
+    evidence["spectrum of the lamp"] = (
         "of the scene"
         if known.lamp is not None
         else "unknown, taken as flat: give --pipeline.datamanager.lamp"
     )
-    decision = replace(light.decision, evidence={**light.decision.evidence, "spectrum of the lamp": spectrum})
+    key = None
+    if moves is not None:
+        others = [each.error for number, each in enumerate(lights) if number != chosen]
+        evidence["moves with"] = "the turntable" if moves.kind == "turntable" else "the camera"
+        evidence["squared error in the other frame over this"] = min(others) / light.error
+        middle = known.frame.to_world(np.array([moves.middle]))[0]
+        key = {"kind": moves.kind, "middle": middle.tolist(), "axis": list(moves.axis)}
+    decision = replace(light.decision, evidence=evidence)
     say(LIGHT_UNKNOWN if decision.is_undecided else f"light: {decision.outcome}")
-    return decision
+    return decision, None if light.direction is None else light.light, key
 
 
 def _copied_environment(folder: Path, scene: Scene) -> Mapping[str, Any]:

@@ -1,7 +1,8 @@
 """Light from infinitely far away: a latitude-longitude picture, looked up and drawn from.
 
-Directions are unit vectors in the scene's world, +z up. The picture is Blender's equirectangular one: u = 0.5 -
-atan2(y, x) / 2 pi from left to right, v = acos(z) / pi from top to bottom, pixel centres at half integers.
+Directions are unit vectors in the scene's world, +z up, or in axes that turn with the camera. The picture is Blender's
+equirectangular one: u = 0.5 - atan2(y, x) / 2 pi from left to right, v = acos(z) / pi from top to bottom, pixel centres
+at half integers.
 
 Notation: `H x W` pixels, `C` colours, `N` directions.
 """
@@ -9,12 +10,46 @@ Notation: `H x W` pixels, `C` colours, `N` directions.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import torch
 from jaxtyping import Float, Float64, Int
 from torch import Tensor
+
+from unmix_plugin.light.lamp import LAMP_FRAMES, LampFrame, moving_axes
+
+
+@dataclass(frozen=True)
+class MovingFrame:
+    """Axes that turn with the camera, in which light stands still: that of an object on a turntable, or of a lamp that
+    the camera carries."""
+
+    kind: LampFrame
+    """Whether it only turns about the axis with the camera, or also goes up and down with it."""
+    middle: tuple[float, float, float]
+    """A point on the axis that cameras look at."""
+    axis: tuple[float, float, float]
+    """Unit vector upwards along the axis."""
+
+    def axes(self, eyes: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3 3"]:
+        """Rows x, y, z of a map that is seen from `eyes`: towards the camera, to its right, and up."""
+        right, up, back = moving_axes(
+            eyes, eyes.new_tensor(self.middle), eyes.new_tensor(self.axis), self.kind
+        )
+        return torch.stack([back, right, up], dim=1)
+
+    def numbers(self) -> tuple[float, ...]:
+        """Seven numbers: 0 for a turntable's frame or 1 for the camera's, then both triples."""
+        return (float(LAMP_FRAMES.index(self.kind)), *self.middle, *self.axis)
+
+    @staticmethod
+    def of_numbers(numbers: Sequence[float]) -> MovingFrame:
+        """The frame of seven numbers; the axis may have any length but 0."""
+        middle, axis = ((numbers[i], numbers[i + 1], numbers[i + 2]) for i in (1, 4))
+        x, y, z = (part / math.hypot(*axis) for part in axis)
+        return MovingFrame(LAMP_FRAMES[int(numbers[0])], middle, (x, y, z))
 
 
 @dataclass(frozen=True)
@@ -27,6 +62,18 @@ class Environment:
     """Turns the light about +z, counter-clockwise seen from above."""
     exposure_stops: float = 0.0
     """Radiance is the picture's times 2 to this power."""
+    moves: MovingFrame | None = None
+    """Whose axes directions are in; None: those of the world."""
+
+    def seen_from(self, eye: Float[Tensor, "3"]) -> Environment:
+        """The light that stands in the world as it does for a camera at `eye`."""
+        if self.moves is None:
+            return self
+        height, width, colours = self.image.shape
+        directions = (
+            directions_of_pixels(height, width).flatten(0, 1).to(self.image) @ self.moves.axes(eye[None])[0].T
+        )
+        return Environment(self.radiance(directions).view(height, width, colours))
 
     @property
     def num_colours(self) -> int:
@@ -34,7 +81,7 @@ class Environment:
         return self.image.shape[2]
 
     def radiance(self, directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N C"]:
-        """Radiance that comes from directions."""
+        """Radiance that comes from directions; differentiable by the picture."""
         height, width, colours = self.image.shape
         u, v = self._picture_coordinates(directions)
         x, y = u * width - 0.5, (v * height - 0.5).clamp(0.0, height - 1.0)
@@ -96,7 +143,7 @@ class Environment:
     @cached_property
     def _weights(self) -> Float64[Tensor, "H W"]:
         """Power that comes from each pixel: the mean of its bilinear radiance times its solid angle."""
-        grey = self.image.double().mean(dim=-1)
+        grey = self.image.detach().double().mean(dim=-1)
         rows = torch.cat([grey[:1], grey, grey[-1:]])
         grey = 0.125 * rows[:-2] + 0.75 * rows[1:-1] + 0.125 * rows[2:]
         grey = 0.125 * grey.roll(1, dims=1) + 0.75 * grey + 0.125 * grey.roll(-1, dims=1)

@@ -2,9 +2,9 @@
 
 At each vertex of a path two directions are drawn: one by the environment's density, one by the material's. Both give
 direct light, weighed by the power heuristic; the material's, where it meets the mesh again, carries the path on.
-Directions, densities and weights have no gradient, reflectances do: the estimate of the radiance is unbiased, and so
-is that of its derivative (detached sampling), since neither the visibility nor the densities of the integral depend
-on the materials.
+Directions, densities and weights have no gradient; reflectances, shading normals and radiances of the environment do
+where they are fitted: the estimate of the radiance is unbiased, and so is that of its derivative (detached sampling),
+since neither the visibility nor the densities of the integral depend on them.
 
 Random numbers are uniform for each path, and evenly spread over the paths of a point: a Sobol sequence over the samples
 is shifted by random numbers of each point (modulo 1).
@@ -69,7 +69,12 @@ class TracedObject:
             torch.arange(num_points, device=device),
             torch.ones(num_points, num_colours, device=device),
         )
-        vertices = _Vertices.of(self.surface, rows, points, white).select(rows.repeat_interleave(samples))
+        turned = None
+        if self.environment.moves is not None:
+            assert points.eyes is not None
+            turned = self.environment.moves.axes(points.eyes)
+        vertices = _Vertices.of(self.surface, rows, points, white, turned)
+        vertices = vertices.select(rows.repeat_interleave(samples))
         vertices = replace(vertices, paths=torch.arange(num_points * samples, device=device))
         radiance = torch.zeros(num_points, num_colours, device=device)
         for depth in range(bounces + 1):
@@ -132,13 +137,18 @@ class _Vertices:
     """Light that reaches the eye from this vertex, a part of it, divided by the density of the path."""
     family: MaterialFamily
     """Of the parameters."""
+    light_axes: Float[Tensor, "M 3 3"] | None
+    """Of the environment, as seen from where each path ends; None: those of the world."""
 
     @staticmethod
-    def of(surface: Surface, paths: Tensor, points: SurfacePoints, throughput: Tensor) -> _Vertices:
+    def of(
+        surface: Surface, paths: Tensor, points: SurfacePoints, throughput: Tensor, light_axes: Tensor | None
+    ) -> _Vertices:
         """Paths that have reached points."""
         axes = frames(points.normals)
         family, parameters = surface.family.decoded(surface.parameters(points.positions))
-        return _Vertices(paths, points, axes, to_local(axes, points.to_eye), parameters, throughput, family)
+        wo = to_local(axes, points.to_eye)
+        return _Vertices(paths, points, axes, wo, parameters, throughput, family, light_axes)
 
     def front(self, directions: Float[Tensor, "M 3"], cosines: Float[Tensor, " M"]) -> Bool[Tensor, " M"]:
         """Whether directions (world) leave the surface: above the shading normal's horizon and the triangle's."""
@@ -150,10 +160,14 @@ class _Vertices:
         return self.family.evaluate(self.parameters, wi, self.wo), density
 
     def select(self, rows: Int[Tensor, " M"]) -> _Vertices:
-        names = ("paths", "axes", "wo", "parameters", "throughput")
-        return replace(
-            self, points=self.points.select(rows), **{name: getattr(self, name)[rows] for name in names}
-        )
+        names = ("paths", "axes", "wo", "parameters", "throughput", "light_axes")
+        parts = {name: getattr(self, name) for name in names}
+        chosen = {name: None if part is None else part[rows] for name, part in parts.items()}
+        return replace(self, points=self.points.select(rows), **chosen)
+
+    def in_light(self, directions: Float[Tensor, "M 3"]) -> Float[Tensor, "M 3"]:
+        """Directions of the world in the environment's axes."""
+        return directions if self.light_axes is None else to_local(self.light_axes, directions)
 
 
 def _shade(
@@ -162,7 +176,9 @@ def _shade(
     """Direct light at vertices by both strategies, and the vertices that the paths reach next; none from the last."""
     light = _light_by_environment(world, vertices, drawn[:, :2])
     wi = vertices.family.sample(vertices.parameters.detach(), vertices.wo, drawn[:, 2:].float())
-    directions = to_world(vertices.axes, wi)
+    directions = to_world(vertices.axes.detach(), wi)
+    if vertices.axes.requires_grad:  # the direction stays where it is in the world, the frame turns
+        wi = to_local(vertices.axes, directions)
     rows = vertices.front(directions, wi[:, 2]).nonzero()[:, 0]
     vertices, wi, directions = vertices.select(rows), wi[rows], directions[rows]
     hits = world.ray_mesh.closest(vertices.points.positions, directions)
@@ -173,23 +189,31 @@ def _shade(
     reflectance, density = vertices.reflection(wi)
     usable = torch.isfinite(density) & (density > 0)
     carried = vertices.throughput * reflectance * torch.where(usable, wi[:, 2] / density, 0.0)[:, None]
-    weight = _power_heuristic(density[free], world.environment.density(directions[free]))
-    escaped = carried[free] * (weight[:, None] * world.environment.radiance(directions[free]))
+    towards = vertices.in_light(directions)[free]
+    weight = _power_heuristic(density[free], world.environment.density(towards))
+    escaped = carried[free] * (weight[:, None] * world.environment.radiance(towards))
     points = world.ray_mesh.points(hits.select(hit), directions[hit])
-    reached = _Vertices.of(world.surface, vertices.paths[hit], points, carried[hit])
+    turned = None if vertices.light_axes is None else vertices.light_axes[hit]
+    reached = _Vertices.of(world.surface, vertices.paths[hit], points, carried[hit], turned)
     return [light, (vertices.paths[free], escaped)], reached
 
 
 def _light_by_environment(world: TracedObject, vertices: _Vertices, drawn: Float[Tensor, "M 2"]) -> _Light:
     """Direct light from directions that the environment draws."""
-    directions, density = world.environment.sample(drawn)
+    towards, density = world.environment.sample(drawn)
+    directions = towards if vertices.light_axes is None else to_world(vertices.light_axes, towards)
     cosines = (directions * vertices.points.normals).sum(dim=-1)
     rows = (vertices.front(directions, cosines) & (density > 0)).nonzero()[:, 0]
     rows = rows[~world.ray_mesh.blocked(vertices.points.positions[rows], directions[rows])]
-    vertices, directions, density = vertices.select(rows), directions[rows], density[rows]
+    vertices, directions, towards, density = (
+        vertices.select(rows),
+        directions[rows],
+        towards[rows],
+        density[rows],
+    )
     reflectance, other = vertices.reflection(to_local(vertices.axes, directions))
     factor = (cosines[rows] * _power_heuristic(density, other) / density)[:, None]
-    radiance = world.environment.radiance(directions)
+    radiance = world.environment.radiance(towards)
     return vertices.paths, vertices.throughput * reflectance * (factor * radiance)
 
 

@@ -8,6 +8,7 @@ picture, `K` of its rays meet the mesh.
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -59,10 +60,13 @@ class SurfacePoints:
     """Unit normals of the triangles, turned to the viewer."""
     to_eye: Float[Tensor, "N 3"]
     """Unit vectors to the viewer."""
+    eyes: Float[Tensor, "N 3"] | None = None
+    """Where rays of cameras that meet the points start; None of other rays."""
 
     def select(self, rows: Tensor) -> SurfacePoints:
         """Some of the points: by a mask or by indices."""
-        return SurfacePoints(**{name: part[rows] for name, part in vars(self).items()})
+        parts = {name: part[rows] for name, part in vars(self).items() if part is not None}
+        return SurfacePoints(**parts)
 
 
 class RayMesh:
@@ -76,6 +80,12 @@ class RayMesh:
         self._faces = self.mesh.faces.reshape(-1).contiguous()
         self._tree: Any = wp.Mesh(wp.from_torch(self._vertices, dtype=wp.vec3f), wp.from_torch(self._faces))
         self._offset = _OFFSET * float(self._vertices.abs().max())
+
+    def with_normals(self, normals: Float[Tensor, "V 3"]) -> RayMesh:
+        """The same triangles with other unit shading normals, which may have a gradient."""
+        turned = copy.copy(self)
+        turned.mesh = replace(self.mesh, normals=normals)
+        return turned
 
     def closest(self, origins: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]) -> Hits:
         """First hits of rays, from either side of a triangle."""
@@ -100,7 +110,8 @@ class RayMesh:
     ) -> tuple[Bool[Tensor, " R"], SurfacePoints]:
         """Which rays meet the mesh, and where each of these does."""
         hits = self.closest(origins, directions)
-        return hits.found, self.points(hits.select(hits.found), directions[hits.found])
+        points = self.points(hits.select(hits.found), directions[hits.found])
+        return hits.found, replace(points, eyes=origins[hits.found])
 
     def points(self, hits: Hits, directions: Float[Tensor, "N 3"]) -> SurfacePoints:
         """Surface points of hits, all of which are found.
