@@ -8,6 +8,8 @@ among them. `unmix-asset` makes an object of each, which is compared with the tr
 lights, its reflectances, its mesh, and where its main light is. With `--compares` materials are fitted from the same
 field with the true mesh, with the true light, and with both, too.
 
+Some objects are measured a second time, turned before the camera and their light on a turntable.
+
 The seeds of the first objects were looked at while settings were chosen, those of the others were not.
 """
 
@@ -35,7 +37,7 @@ RELIT = _common.Limit(33.0, unit=" dB")
 ANGLE = _common.Limit(0.03, is_upper=True, unit=" rad")
 CHAMFER = _common.Limit(1.0, is_upper=True, unit=" pixels")
 LIGHT = _common.Limit(10.0, is_upper=True, unit=" degrees")
-ALONE = "cubes alone"
+ALONE, TURNED = "cubes alone", "cubes alone, light that turns with the camera"
 WAYS: dict[str, tuple[str, ...]] = {
     "true mesh": ("mesh",),
     "true light": ("environment",),
@@ -63,6 +65,8 @@ class Options:
     """Which objects."""
     kept_apart: tuple[int, ...] = (11, 12)
     """Objects that nobody looked at while settings were chosen."""
+    turned: tuple[int, ...] = (2, 12)
+    """Objects that are made again of cubes in light that turns with the camera."""
     size: int = 96
     """Rows and columns of the pictures."""
     views: int = 24
@@ -87,6 +91,8 @@ class Options:
 
 def main(options: Options) -> None:
     """Make, measure, publish."""
+    from unmix_plugin.neumatex.tracing.environment import MovingFrame
+
     size, views, bands = (24, 8, 8) if options.quick else (options.size, options.views, options.bands)
     times = (3.0, 2.0) if options.quick else (options.field_seconds, options.material_seconds)
     seeds = options.seeds[:1] if options.quick else (*options.seeds, *options.kept_apart)
@@ -101,13 +107,19 @@ def main(options: Options) -> None:
     machine = _machine.describe_machine(options.device)
     measured: dict[str, list[dict[str, Any]]] = {ALONE: []}
     measured |= {way: [] for way in WAYS if options.compares and not options.quick}
+    measured |= {TURNED: []}
     with ExitStack() as stack:
         root = options.runs or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="asset-")))
         for seed in seeds:
-            truth = written_object(root / f"object-{seed}-{size}", seed, size, views, bands)
-            capture = as_captured(truth, root / f"capture-{seed}-{size}")
             for way, rows in measured.items():
-                if way == ALONE:
+                if way == TURNED and seed not in options.turned:
+                    continue
+                name, moves = f"{seed}-{size}", None
+                if way == TURNED:
+                    name, moves = f"{name}-turned", MovingFrame("turntable", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+                truth = written_object(root / f"object-{name}", seed, size, views, bands, moves)
+                capture = as_captured(truth, root / f"capture-{name}")
+                if way in (ALONE, TURNED):
                     found = make_asset(capture, truth, root / "runs", times, options.device)
                 else:
                     found = fit_given(
@@ -153,8 +165,8 @@ def as_captured(truth: Path, folder: Path) -> Path:
     shutil.copytree(truth, folder, ignore=shutil.ignore_patterns("mesh.glb"))
     content = json.loads((folder / "transforms.json").read_text(encoding="utf-8"))
     (folder / "environment.exr").unlink()
-    for key in ("mesh_path", "environment_path"):
-        del content[key]
+    for key in ("mesh_path", "environment_path", "environment_moves"):
+        content.pop(key, None)
     for frame in content["frames"]:
         path = folder / frame["hyperspectral_file_path"]
         np.save(path, np.load(path).astype(np.float32) / np.float32(white))
@@ -180,7 +192,7 @@ def make_asset(
         ended = _common.run_command([_common.console_script("unmix-asset"), *words, "--overwrite"])
         content = json.loads((Path(made) / "asset.json").read_text(encoding="utf-8"))
         figures = {name: content["figures"].get(name) for name in COLUMNS}
-        off = light_angle_deg(Path(made) / "environment.exr", truth / "environment.exr")
+        off = light_angle_deg(Path(made) / "environment.exr", truth)
     decided = {each["subject"]: each["outcome"] for each in content["decisions"]}
     chamfer = mesh_distances(Path(content["runs"]["materials"]), truth)
     found = {**figures, **chamfer, "light_angle_deg": off, "seconds": ended.seconds}
@@ -202,14 +214,17 @@ def fit_given(
     return {name: figures.get(name) for name in COLUMNS}
 
 
-def light_angle_deg(found: Path, true: Path) -> float:
-    """Between the brightest directions of two environments."""
+def light_angle_deg(found: Path, truth: Path) -> float:
+    """Between the brightest directions of an environment and of that of an object, as it stands for the first view."""
+    from unmix_plugin.neumatex.fit.object_scene import load_object
     from unmix_plugin.neumatex.tracing.environment import directions_of_pixels
     from unmix_plugin.neumatex.tracing.light_files import read_exr
 
+    known = load_object(truth)
+    true = known.environment.seen_from(known.pictures.cameras.camera_to_world[0, :, 3])
     brightest = []
-    for path in (found, true):
-        grey = torch.from_numpy(read_exr(path)[0].mean(axis=-1))
+    for picture in (torch.from_numpy(read_exr(found)[0]), true.image):
+        grey = picture.mean(dim=-1)
         brightest.append(directions_of_pixels(*grey.shape).flatten(0, 1)[int(grey.argmax())].double())
     return math.degrees(math.acos(float((brightest[0] @ brightest[1]).clamp(-1, 1))))
 
@@ -240,6 +255,7 @@ def judge(measured: Mapping[str, list[dict[str, Any]]], kept_apart: tuple[int, .
     groups = {
         ALONE: measured[ALONE],
         f"{ALONE}, kept apart": [row for row in measured[ALONE] if row["seed"] in kept_apart],
+        TURNED: measured[TURNED],
     }
     for name, rows in groups.items():
         if not rows:
@@ -252,7 +268,7 @@ def judge(measured: Mapping[str, list[dict[str, Any]]], kept_apart: tuple[int, .
             LIGHT.judge(f"{name}: main light, worst", max(row["light_angle_deg"] for row in rows)),
         ]
     for way, rows in measured.items():
-        if way != ALONE and rows:
+        if way in WAYS and rows:
             relit, angle = (mean(row[key] for row in rows) for key in ("relit_psnr", "reflectance_angle"))
             figures.append(
                 _common.reported(f"{way}: relit, reflectance angle", f"{relit:.2f} dB, {angle:.4f} rad")

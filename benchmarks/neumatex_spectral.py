@@ -23,13 +23,16 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import _common
 import _machine
 import numpy as np
 import torch
 import tyro
+
+if TYPE_CHECKING:
+    from unmix_plugin.neumatex.tracing.environment import MovingFrame
 
 ANGLE = _common.Limit(0.03, is_upper=True, unit=" rad")
 CORRELATION = _common.Limit(0.1, is_upper=True)
@@ -115,8 +118,10 @@ def main(options: Options) -> None:
     _common.publish(report, _common.results_folder(options.results, options.quick))
 
 
-def written_object(folder: Path, seed: int, size: int, views: int, bands: int) -> Path:
-    """An object's folder, made if it is not there."""
+def written_object(
+    folder: Path, seed: int, size: int, views: int, bands: int, moves: MovingFrame | None = None
+) -> Path:
+    """An object's folder, made if it is not there; in light that turns with the camera in a frame."""
     from tools.procedural_objects import seeded_lights, seeded_mesh
     from unmix_plugin.neumatex.demo.objects import DEFAULT_SPECTRAL_LIGHTS, write_spectral_object
     from unmix_plugin.scenes.demo.scene import written_once
@@ -125,7 +130,7 @@ def written_object(folder: Path, seed: int, size: int, views: int, bands: int) -
         print(f"object {seed}: rendering its pictures ...", flush=True)
         first = DEFAULT_SPECTRAL_LIGHTS[0]
         lights = [first, *[name for name in seeded_lights(seed) if name != first][:2]]
-        write_spectral_object(place, seeded_mesh(seed), lights, size, views, bands, seed)
+        write_spectral_object(place, seeded_mesh(seed), lights, size, views, bands, seed, moves=moves)
 
     return written_once(folder, f"object {seed}", write, Path.is_dir)
 
