@@ -146,7 +146,7 @@ def reflectance_errors(scene: Path, size: int, views: int) -> dict[str, float]:
 def dropped_bands(scene: Path) -> list[str]:
     """Bands that were left out, with the reason."""
     record = json.loads((scene / "process.json").read_text(encoding="utf-8"))
-    (sensor,) = record["decisions"]["sensors"].values()
+    (sensor,) = record["plan"]["sensors"].values()
     return [f"{band['wavelength_nm']:g} nm: {band['reason']}" for band in sensor["dropped_bands"]]
 
 

@@ -1,6 +1,7 @@
 """The demo scene as raw counts, which calibration by hand turns into the truth; and its poses, found in them."""
 
 import json
+import re
 from functools import partial
 from pathlib import Path
 
@@ -143,9 +144,11 @@ def test_estimated_poses_are_those_of_the_truth(tmp_path, monkeypatch):
     assert len(loaded.frames) == len(names)
     assert loaded.placement.is_identity, "exports come out in the upright world of transforms.json"
     report = (scene / "report.txt").read_text()
-    assert "- bands left out: 400 nm, 509.091 nm (marked as bad in the file)\n" in report
-    assert "- bands left out: 618.182 nm (the white reference is saturated there)\n" in report
-    assert "- saturation: from 65535 (" in report
+    left_out = (
+        "marked as bad in the file (400 nm, 509.091 nm), the white reference is saturated there (618.182 nm)"
+    )
+    assert left_out in " ".join(report.split())
+    assert re.search(r"saturation +from 65535\n", report)
 
 
 def test_a_backdrop_shines_past_the_things(tmp_path, folder, truth):

@@ -58,7 +58,7 @@ def made(tmp_path: Path, capture, **options):
 
 
 def scale_of(scene: Path) -> float:
-    return record_of(scene)["decisions"]["scale"]["calibrated"]
+    return record_of(scene)["plan"]["scale"]["calibrated"]
 
 
 def record_of(scene: Path):
@@ -304,7 +304,8 @@ def test_reflectances_that_files_hold_are_seen_in_flat_light_if_a_white_is_1(
         write_cube(capture.root, view, (values * top).astype(dtype), header=header)
     write_poses(capture.root / "transforms.json", names)
     scene, _ = made(tmp_path, capture)
-    assert f"values are {unit}" in (tmp_path / "scene" / "report.txt").read_text().replace("\n  ", " ")
+    [found] = [each for each in record_of(tmp_path / "scene")["decisions"] if each["subject"] == "values"]
+    assert found["outcome"].startswith(unit)
     assert (scene.illuminant is not None) == is_known
     if is_known:
         np.testing.assert_array_equal(scene.illuminant, np.ones(len(WAVELENGTHS_NM)))
@@ -314,12 +315,12 @@ def test_reflectances_that_files_hold_are_seen_in_flat_light_if_a_white_is_1(
 def test_what_was_done_is_written_for_people(tmp_path: Path, capture):
     _, findings = made(tmp_path, capture, drop_bands="500-600")
     report = (tmp_path / "scene" / "report.txt").read_text()
-    assert "bands left out: 500 nm, 550 nm, 600 nm (named in --drop-bands)" in report
+    assert "named in --drop-bands (500 nm, 550 nm, 600 nm)" in report
     assert findings[0] == "only 4 views: expect holes and fog; 15 or more all around serve better"
     assert findings[0] in report
     record = record_of(tmp_path / "scene")
     assert record["what_looks_wrong"] == findings
-    dropped = record["decisions"]["sensors"]["all views"]["dropped_bands"]
+    dropped = record["plan"]["sensors"]["all views"]["dropped_bands"]
     assert [band["wavelength_nm"] for band in dropped] == [500.0, 550.0, 600.0]
 
 
@@ -583,10 +584,11 @@ def test_a_backdrop_is_cut_out_also_where_nobody_named_it(tmp_path: Path, mask):
         np.testing.assert_allclose(scene.cube(index)[BRIGHT_SQUARE], expected, atol=0.02)
     if mask == "auto":
         report = (tmp_path / "scene" / "report.txt").read_text()
-        assert "backdrop found, black (0.020): 25% of the pixels are foreground" in report
-        decisions = record_of(tmp_path / "scene")["decisions"]
-        assert decisions["mask"] == "auto"
-        assert decisions["sensors"]["all views"]["background"]["kind"] == "found"
+        assert "backdrop black (0.020)" in report
+        assert "- 25% of the pixels are foreground, the rest is cut out" in report
+        plan = record_of(tmp_path / "scene")["plan"]
+        assert plan["mask"] == "auto"
+        assert plan["sensors"]["all views"]["background"]["kind"] == "found"
 
 
 def test_without_a_backdrop_all_of_each_image_is_the_scene(tmp_path: Path, capture):
@@ -596,4 +598,4 @@ def test_without_a_backdrop_all_of_each_image_is_the_scene(tmp_path: Path, captu
         write_cube(capture.root, name, counts.astype(np.uint16))
     assert not made(tmp_path, capture, mask="auto")[0].has_alpha
     report = " ".join((tmp_path / "scene" / "report.txt").read_text().split())
-    assert "no mask of the foreground: all of each image belongs to the scene" in report
+    assert "none: all of each view is the scene" in report

@@ -149,8 +149,9 @@ class Plan:
         return ", ".join(each.in_words for each in found if isinstance(each, Backdrop))
 
     @property
-    def decisions(self) -> dict[str, Any]:
-        """With their reasons, as JSON-able values."""
+    def numbers(self) -> dict[str, Any]:
+        """What views are written by, with its sources, as JSON-able values: for programs, and to tell whether an
+        interrupted start can go on. What was decided, and why, is in the table of decisions."""
         from unmix_plugin.spectral.colour.conversion import describe_colour
 
         each = {}

@@ -85,8 +85,8 @@ def write_scene_files(
     record = {
         "made_by": f"unmix-process {__version__}",
         "options": plain_options(written.options),
-        "decisions": plan.decisions,
-        "decided": [decision.to_json() for decision in decided],
+        "plan": plan.numbers,
+        "decisions": [decision.to_json() for decision in decided],
         "stored": {"type": "uint16", "value_scale": FULL_SCALE, "calibrated_value_of_1": scale},
         "poses": {"source": posed.poses.source, "notes": sentences(posed.remarks, Kind.DONE), **posed.keys},
         "notes": sentences(plan.remarks, Kind.DONE),

@@ -192,7 +192,7 @@ def fingerprint(plan: Plan, options: ProcessOptions, lenses: Mapping[str, Lens])
     return {
         "version": __version__,
         "options": fixed,
-        "decisions": plan.decisions,
+        "plan": plan.numbers,
         "bands": {name: sensor.centers_nm.tolist() for name, sensor in plan.sensors.items()},
         "gains": sorted({repr((one.gains.tolist(), one.offsets.tolist())) for one in stated}),
         "files": stamps,

@@ -26,12 +26,12 @@ from unmix_plugin.captures.plan import Plan
 from unmix_plugin.captures.poses.line_motion import averaged_lines, middle_of
 from unmix_plugin.captures.posing import PosedViews
 from unmix_plugin.captures.report import Kind, Remark, sentences
-from unmix_plugin.captures.writing.view_files import FULL_SCALE, BackgroundRule, ViewRecord
+from unmix_plugin.captures.writing.view_files import BackgroundRule, ViewRecord
 from unmix_plugin.engine.decisions import UNDECIDED, Decision
 from unmix_plugin.errors import counted, name_some
 
 _MOST_LISTED, _MOST_BANDS = 4, 8
-"""Views and bands that are left out, in the table of decisions; bands left out for one reason that are named."""
+"""Views that are left out, and bands left out for one reason, that the table of decisions names."""
 
 
 @dataclass(frozen=True)
@@ -148,10 +148,18 @@ def decisions_of(written: WrittenViews, posed: PosedViews) -> list[Decision]:
         if exposure is not None:
             ends = dict.fromkeys(f"{number:g}" for number in (exposure.min(), exposure.max()))
             brought = f"all brought to {' to '.join(ends)} s"
-        stored, dropped, nm = sensor.saturation.stored, sensor.bands.dropped, sensor.bands.wavelengths_nm
-        listed = {f"{nm[index]:g} nm": dropped[index].reason for index in sorted(dropped)[:_MOST_LISTED]}
-        more = {"others": len(dropped) - len(listed)} if len(dropped) > len(listed) else {}
+        stored, nm = sensor.saturation.stored, sensor.bands.wavelengths_nm
+        dropped: dict[str, list[str]] = defaultdict(list)
+        for index, band in sorted(sensor.bands.dropped.items()):
+            reason = "noisy" if band.fault is BandFault.NOISY else band.reason
+            dropped[reason].append(f"{nm[index]:g} nm")
         decisions += [
+            Decision(
+                f"values{where}",
+                sensor.meaning.description,
+                {"wavelengths from": sensor.bands.source},
+                flag="--wavelengths, --white",
+            ),
             Decision(
                 f"exposure{where}",
                 brought,
@@ -168,7 +176,7 @@ def decisions_of(written: WrittenViews, posed: PosedViews) -> list[Decision]:
             Decision(
                 f"bands{where}",
                 f"{len(sensor.bands.kept)} of {len(nm)} kept",
-                {**listed, **more},
+                {reason: f"({name_some(names, _MOST_BANDS)})" for reason, names in dropped.items()},
                 f"more than half of the bands noisier than {options.max_noise:g} of their signal",
                 "--drop-bands, --max-noise",
             ),
@@ -176,6 +184,8 @@ def decisions_of(written: WrittenViews, posed: PosedViews) -> list[Decision]:
     above = max(
         (float((sensor.sample > plan.scale.value).mean()) for sensor in plan.sensors.values()), default=0.0
     )
+    rules = [r.background for r in plan.recipes.values() if isinstance(r.background, BackgroundRule)]
+    levels = ", ".join(f"{rule.level:.3f} (threshold {rule.threshold:.3f})" for rule in rules)
     masks = {
         "auto": "a backdrop that all views share is cut out",
         "files": "from files",
@@ -195,7 +205,11 @@ def decisions_of(written: WrittenViews, posed: PosedViews) -> list[Decision]:
         Decision(
             "mask",
             masks.get(plan.mask, plan.mask),
-            {"asked": options.mask, **({"backdrop": found} if (found := plan.backdrops_in_words) else {})},
+            {
+                "asked": options.mask,
+                **({"backdrop": plan.backdrops_in_words} if plan.backdrops_in_words else {}),
+                **({"background at": levels} if levels else {}),
+            },
             "borders with texture, or that differ between views" if options.mask == "auto" else "",
             "--mask",
         ),
@@ -212,28 +226,8 @@ def decisions_of(written: WrittenViews, posed: PosedViews) -> list[Decision]:
 
 
 def what_was_done(written: WrittenViews, posed: PosedViews) -> list[str]:
-    """Decisions and totals, one sentence each."""
-    plan, views, lines = written.plan, [view.record for view in written.seen(posed)], []
-    for name, sensor in plan.sensors.items():
-        where, used = f"{name}: " if name else "", sensor.references_used
-        lines.append(
-            f"{where}values are {sensor.meaning.description}; wavelengths from {sensor.bands.source}"
-        )
-        for key, what in (("dark", "dark frame"), ("white", "white reference")):
-            lines += [f"{where}{what}: {used[key]['use']}"] if key in used else []
-        stored, reason = sensor.saturation.stored, sensor.saturation.reason
-        lines.append(f"{where}saturation: {reason if stored is None else f'from {stored:g} ({reason})'}")
-        dropped: dict[str, list[str]] = defaultdict(list)
-        for index, band in sorted(sensor.bands.dropped.items()):
-            reason = "noisy" if band.fault is BandFault.NOISY else band.reason
-            dropped[reason].append(f"{sensor.bands.wavelengths_nm[index]:g} nm")
-        lines += [
-            f"{where}bands left out: {name_some(names, _MOST_BANDS)} ({reason})"
-            for reason, names in dropped.items()
-        ]
-    lines.append(
-        f"{plan.scale.value:g} is written as 1: {plan.scale.reason}; full scale of the cubes is {FULL_SCALE}"
-    )
+    """Totals of what was written, and what was done on the way, one sentence each; `decisions_of` tells why."""
+    plan, views = written.plan, [view.record for view in written.seen(posed)]
 
     def total(what: str) -> str:
         noun = what.rpartition("_")[2].removesuffix("s")
@@ -241,26 +235,18 @@ def what_was_done(written: WrittenViews, posed: PosedViews) -> list[str]:
 
     num_values = sum(view.num_pixels * len(plan.sensors[view.sensor].centers_nm) for view in views)
     negative = sum(view.negative_values for view in views) / max(num_values, 1)
-    lines.append(
+    values = (
         f"{total('saturated_pixels')} with saturated bands, which are written as 1; {total('clipped_values')} above 1, "
         f"written as 1 too; {total('negative_values')} below 0 ({negative:.1%} of all), written as 0; "
         f"{total('missing_pixels')} masked, as nothing was measured there"
     )
-    share = f"{np.mean([view.matter_share for view in views]):.0%} of the pixels are foreground"
-    found = plan.backdrops_in_words
-    changed = f"{total('specks')} removed, {total('holes')} filled"
-    if found:
+    lines = [values]
+    if plan.mask != "none" or plan.backdrops_in_words:
+        line = f"{np.mean([view.matter_share for view in views]):.0%} of the pixels are foreground"
+        if plan.mask != "files":
+            line += f", the rest is cut out; {total('specks')} removed, {total('holes')} filled"
         whole = sum(view.matter_share == 1.0 for view in views)
-        lines.append(
-            f"backdrop found, {found}: {share}, the rest is cut out with soft "
-            f"edges; {changed}" + (f"; {counted(whole, 'view')} without any of it" if whole else "")
-        )
-    elif plan.mask == "none":
-        lines.append("no mask of the foreground: all of each image belongs to the scene")
-    elif plan.mask == "files":
-        lines.append(f"masks from files; {share}")
-    else:
-        rules = [r.background for r in plan.recipes.values() if isinstance(r.background, BackgroundRule)]
-        levels = ", ".join(f"{rule.level:.3f} (threshold {rule.threshold:.3f})" for rule in rules)
-        lines.append(f"{plan.mask} background at {levels}; {share}; {changed}")
+        if plan.backdrops_in_words and whole:
+            line += f"; {counted(whole, 'view')} without any backdrop"
+        lines.append(line)
     return [*lines, *(text for one in (posed, plan) for text in sentences(one.remarks, Kind.DONE))]
