@@ -17,6 +17,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
+from weakref import WeakKeyDictionary
 from xml.etree import ElementTree
 
 import numpy as np
@@ -258,9 +259,19 @@ class RadiometricModel:
         return ((values - self.black_level) * factor[..., None]).astype(np.float32)
 
 
+_MODELS: WeakKeyDictionary[Cube, RadiometricModel | None] = WeakKeyDictionary()
+"""Of cubes that are open, as every strip of a cube is calibrated by its model."""
+
+
 def radiometric_model(file: Cube) -> RadiometricModel | None:
-    """The calibration that a file carries in its camera's tags; None where there is none. Raises
-    CaptureError: the file has a calibration that lacks a number, or one that can't be."""
+    """The calibration that a file carries in its camera's tags, worked out once a cube; None where there is none.
+    Raises CaptureError: the file has a calibration that lacks a number, or one that can't be."""
+    if file not in _MODELS:
+        _MODELS[file] = _read_model(file)
+    return _MODELS[file]
+
+
+def _read_model(file: Cube) -> RadiometricModel | None:
     tags, exif = file.camera.xmp, file.camera.exif
     read = next((read for mark, read in _MAKERS.items() if tag_numbers(tags, mark) is not None), None)
     if read is None:

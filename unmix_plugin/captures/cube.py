@@ -226,9 +226,9 @@ class CameraTags:
     """By tifffile's names; numbers, texts or lists of numbers."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Cube:
-    """One image of (H, W, B) numbers on disk."""
+    """One image of (H, W, B) numbers on disk; equal to itself alone."""
 
     path: Path
     """The file that was named: a header where there is one."""

@@ -201,6 +201,9 @@ _LEAST_DIFFERENCES = 200
 def sharpness_of(brightness: Float32[np.ndarray, "H W"], seen: Bool[np.ndarray, "H W"]) -> list[float]:
     """Contrast of fine structures over that of coarse ones, along rows and along columns; nothing in small views.
 
+    What views are left out by: of structures wider than the noise of single pixels, by direction, and against the views
+    around, before poses are known. `detail_of` warns of less, by single pixels, against all views.
+
     Both are root mean squares of second differences between three pixels in a line, where all are seen. A blur takes
     the fine ones, in its direction alone if the camera moved.
     """

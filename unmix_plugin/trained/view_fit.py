@@ -95,7 +95,8 @@ def fit_of_view(view: ThinnedView) -> ViewFit | None:
 
 
 def _fine_contrast(picture: Float64[np.ndarray, "h w"], counts: Bool[np.ndarray, "h w"]) -> float:
-    """Root mean square of second differences along rows and columns."""
+    """Root mean square of second differences along rows and columns; it is compared with that of the same pixels as
+    rendered, so that unlike sharpness within a capture it needs no coarse contrast to be divided by."""
     squares = []
     for image, known in ((picture, counts), (picture.T, counts.T)):
         inside = known[:, :-2] & known[:, 1:-1] & known[:, 2:]

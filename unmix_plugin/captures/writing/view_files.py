@@ -306,6 +306,9 @@ def _cut_out(path: Path, start: int, tally: _Tally, recipe: ViewRecipe) -> None:
 def detail_of(brightness: Float32[np.ndarray, "H W"], seen: Bool[np.ndarray, "H W"]) -> float:
     """Contrast of the finest structures against those twice as large; falls when a picture is blurred.
 
+    What users are warned by: the slightest blur changes it, but so does noise, so that no view is left out for it; that
+    is `sharpness_of`'s task, which looks at wider structures.
+
     Both are root mean squares of differences between a pixel and the mean of its neighbours, at full and at half
     resolution, over pixels that are seen; 0 where there are too few of these.
     """
