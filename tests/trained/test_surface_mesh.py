@@ -140,6 +140,6 @@ def test_smoothed_normals_of_a_rough_ball_are_nearer_to_those_of_the_ball():
     rough = np.random.default_rng(0).normal(1, 0.02, len(ball.vertices))[:, None] * ball.vertices
     mesh = TriangleMesh(rough, ball.faces.astype(np.int64))
     angles = [np.degrees(np.arccos((each * ball.vertices).sum(axis=1).clip(-1, 1))).mean()
-              for each in (mesh.normals, mesh.smoothed_normals())]  # fmt: skip
+              for each in (mesh.normals, mesh.smoothed_normals)]  # fmt: skip
     assert angles[1] < 0.4 * angles[0]
-    np.testing.assert_allclose(np.linalg.norm(mesh.smoothed_normals(), axis=1), 1)
+    np.testing.assert_allclose(np.linalg.norm(mesh.smoothed_normals, axis=1), 1)

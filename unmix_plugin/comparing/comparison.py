@@ -369,7 +369,7 @@ class _Smoothing:
         """With links along the edges of its triangles."""
         from scipy.sparse import identity
 
-        links = TriangleMesh(surface.positions, surface.faces).links()
+        links = TriangleMesh(surface.positions, surface.faces).links
         self._links = (links + identity(len(surface.positions))).tocsr()
 
     def places(self, values: Float[np.ndarray, " P"], rings: int) -> Float64[np.ndarray, " P"]:

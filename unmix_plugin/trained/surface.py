@@ -146,11 +146,12 @@ class SeenSurface:
         images = torch.zeros(len(positions))
         for camera, distances in self._views:
             inside, excess = _excess_px(camera, distances, positions)
+            images[inside] += 1
             parts = (excess / (self._factor * reach_px)).clamp(max=1)
-            rows = inside.nonzero()[:, 0][parts > -1]
-            sums[rows] += parts[parts > -1]
+            near = (parts > -1).nonzero()[:, 0]
+            rows = inside[near]
+            sums[rows] += parts[near]
             counts[rows] += 1
-            images += inside
         if is_closed:
             counts[(counts == 1) & (images > _MANY_IMAGES)] = 0
         is_hidden = images >= min(_FEWEST_IMAGES, len(self._views))
@@ -179,10 +180,12 @@ def in_image(
 
 def _excess_px(
     camera: Cameras, distances: Float[Tensor, "H W"], positions: Float[Tensor, "P 3"], least: float = 0.0
-) -> tuple[Bool[Tensor, " P"], Float[Tensor, " inside"]]:
-    """Which points are in the image, and by how many pixels, as large as they are there and at least so many model
-    units, it sees farther than each."""
-    inside, coords, depths = in_image(camera, positions)
+) -> tuple[Int64[Tensor, " inside"], Float[Tensor, " inside"]]:
+    """Indices of the points in the image, and by how many pixels, as large as they are there and at least so many
+    model units, it sees farther than each."""
+    coords, depths, is_inside = look_up(camera, 0, positions)
+    inside = is_inside.nonzero()[:, 0]
+    coords, depths = coords[inside], depths[inside]
     columns, rows = coords.long().unbind(-1)
     places = camera.poses_at(torch.zeros_like(rows), coords[:, 1])[:, :, 3]
     own = (positions[inside] - places).norm(dim=-1)
@@ -261,8 +264,12 @@ class GridPoints:
         """Points of some slices along x."""
         _, num_y, num_z = self.shape
         cells = torch.cartesian_prod(torch.tensor(indices), torch.arange(num_y), torch.arange(num_z))
-        points = torch.from_numpy(self.origin).double() + self.cell * cells
-        return points.float().view(len(indices), num_y, num_z, 3)
+        return self.points_at(cells.numpy()).view(len(indices), num_y, num_z, 3)
+
+    def points_at(self, indices: Int64[np.ndarray, "n 3"]) -> Float[Tensor, "n 3"]:
+        """Points by their indices along x, y and z."""
+        points = torch.from_numpy(self.origin).double() + self.cell * torch.from_numpy(indices)
+        return points.float()
 
     def slabs(self, most_points: int) -> list[range]:
         """Slices along x, as many at a time as hold at most so many points, but at least one."""

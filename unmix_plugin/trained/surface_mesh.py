@@ -14,7 +14,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import TypeAlias
+from functools import cached_property
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -61,6 +62,7 @@ class TriangleMesh:
         used, renumbered = np.unique(faces, return_inverse=True)
         return TriangleMesh(self.vertices[used], renumbered.reshape(faces.shape))
 
+    @cached_property
     def links(self):  # noqa: ANN201 - a sparse matrix of scipy, which is imported here only
         """Symmetric matrix (V, V) that is 1 where an edge joins two vertices."""
         from scipy.sparse import coo_matrix
@@ -76,17 +78,17 @@ class TriangleMesh:
         """Number of the piece that each face is of; vertices join faces to one."""
         from scipy.sparse.csgraph import connected_components
 
-        return connected_components(self.links(), directed=False)[1][self.faces[:, 0]].astype(np.int64)
+        return connected_components(self.links, directed=False)[1][self.faces[:, 0]].astype(np.int64)
 
     def smoothed(self, values: Float[np.ndarray, " V"], rings: int) -> Float64[np.ndarray, " V"]:
         """Numbers of vertices, each replaced as often as `rings` by the mean of itself and its neighbours."""
-        links = self.links()
+        links = self.links
         counts = 1 + np.asarray(links.sum(axis=1)).ravel()
         for _ in range(rings):
             values = (values + links @ values) / counts
         return values.astype(np.float64)
 
-    @property
+    @cached_property
     def normals(self) -> Float[np.ndarray, "V 3"]:
         """Unit normals of the vertices: means over their faces, weighted by area."""
         a, b, c = self.vertices[self.faces].swapaxes(0, 1)
@@ -97,6 +99,7 @@ class TriangleMesh:
         lengths = np.linalg.norm(sums, axis=1, keepdims=True)
         return np.where(lengths > 0, sums / np.where(lengths > 0, lengths, 1.0), [0.0, 0.0, 1.0])
 
+    @cached_property
     def smoothed_normals(self) -> Float64[np.ndarray, "V 3"]:
         """Unit normals of the vertices, each the mean of those around it: of a surface that a short training left
         rough, they are nearer to the true ones."""
@@ -106,7 +109,7 @@ class TriangleMesh:
     def areas(self) -> Float64[np.ndarray, " F"]:
         """Of the faces, as large as they are seen along the smoothed normal: rough surfaces of short trainings have
         more area than what they stand for."""
-        along = self.smoothed_normals()[self.faces].sum(axis=1)
+        along = self.smoothed_normals[self.faces].sum(axis=1)
         along /= np.linalg.norm(along, axis=1, keepdims=True).clip(min=1e-12)
         a, b, c = self.vertices[self.faces].swapaxes(0, 1)
         return np.maximum((np.cross(b - a, c - a) * along).sum(axis=1) / 2, 0.0)
@@ -173,7 +176,7 @@ def surface_of(
         mesh = without_stray_pieces(mesh.select(is_solid[piece]))
 
         is_seen = seen.shows(torch.from_numpy(mesh.vertices).float()).numpy()
-        links = mesh.links()
+        links = mesh.links
         for _ in range(_HEALED_RINGS):
             is_seen = is_seen | np.asarray(links @ is_seen.astype(np.float64) > 0)
         shown, areas = np.all(is_seen[mesh.faces], axis=1, keepdims=False), mesh.areas()
@@ -198,7 +201,7 @@ def _distances_on(
 ) -> Float32[np.ndarray, "X Y Z"]:
     """Signed distances at the points of a grid, pixels, up to the reach: measured near the surface, elsewhere
     interpolated from a coarse grid."""
-    from scipy.ndimage import map_coordinates
+    from scipy.ndimage import affine_transform
 
     coarse = GridPoints.over(scene.scene_box.aabb, max(8, (max(grid.shape) - 1) // _COARSER))
     reach, wide = (max(_REACH_PX, _REACH_CELLS * one.cell / scene.pixel_size) for one in (grid, coarse))
@@ -209,15 +212,16 @@ def _distances_on(
         ]
     )
     first, found = first.view(coarse.shape).numpy(), np.empty(grid.shape, np.float32)
+    finer = grid.cell / coarse.cell
     for slab in follow("measuring distances to the surface", grid.slabs(_POINTS_AT_ONCE)):
-        points = grid.slab_points(slab).flatten(0, 2)
-        parts = map_coordinates(
-            first, ((points.numpy() - coarse.origin) / coarse.cell).T, order=1, mode="nearest"
-        )
+        corner: Any = (grid.origin - coarse.origin) / coarse.cell + finer * np.array([slab.start, 0, 0])
+        shape = (len(slab), *grid.shape[1:])
+        parts = affine_transform(first, np.full(3, finer), corner, shape, order=1, mode="nearest")
         near = np.abs(parts) < _NEAR
         parts = (parts * (wide / reach)).clip(-1, 1)
-        parts[near] = seen.signed_distance(points[torch.from_numpy(near)], reach, is_closed).numpy()
-        found[slab.start : slab.stop] = reach * parts.reshape(len(slab), *grid.shape[1:])
+        points = grid.points_at(np.argwhere(near) + np.array([slab.start, 0, 0]))
+        parts[near] = seen.signed_distance(points, reach, is_closed).numpy()
+        found[slab.start : slab.stop] = reach * parts
     return found
 
 

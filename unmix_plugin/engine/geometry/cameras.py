@@ -150,6 +150,8 @@ class Cameras:
     def poses_at(self, camera_indices: Int[Tensor, " R"], y: Float[Tensor, " R"]) -> Float[Tensor, "R 3 4"]:
         """Camera to world at heights in the images, px."""
         if self.key_poses is None:
+            if len(self.camera_to_world) == 1:  # which is not copied for every ray
+                return self.camera_to_world.expand(len(camera_indices), 3, 4)
             return self.camera_to_world[camera_indices]
         return self.key_poses.at(camera_indices, y)
 

@@ -88,7 +88,7 @@ def _averaging(faces: Int[Tensor, "F 3"], num_vertices: int) -> tuple[Tensor, Te
     from scipy.sparse import identity
 
     mesh = TriangleMesh(np.zeros((num_vertices, 3)), faces.cpu().numpy().astype(np.int64))
-    links = (mesh.links() + identity(num_vertices)).tocoo()
+    links = (mesh.links + identity(num_vertices)).tocoo()
     rows, columns = (torch.from_numpy(part).long().to(faces.device) for part in (links.row, links.col))
     counts = torch.bincount(rows, minlength=num_vertices).float()
     return rows, columns, (1 / counts)[rows, None]

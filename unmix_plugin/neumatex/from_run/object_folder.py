@@ -266,7 +266,7 @@ def _write_mesh(folder: Path, recipe: ObjectRecipe, loaded: LoadedRun, say: Say)
         vertices, faces = found[:2]
     vertices = positions_for_files(loaded.scene.frame.to_world(vertices))
     # Highlights show where a surface faces: of a rough one, normals are smoothed, places stay.
-    normals = TriangleMesh(vertices, faces).smoothed_normals().astype(np.float32)
+    normals = TriangleMesh(vertices, faces).smoothed_normals.astype(np.float32)
     columns = {name: vertices[:, axis] for axis, name in enumerate("xyz")}
     columns |= {name: normals[:, axis] for axis, name in enumerate(("nx", "ny", "nz"))}
     write_ply(folder / "mesh.ply", columns, faces, ("surface of an unmix-nerf run",))
