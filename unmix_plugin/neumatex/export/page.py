@@ -68,12 +68,14 @@ class ObjectForPage:
     """That it can be seen in, by name."""
     pictures: Mapping[str, Float[Tensor, "H W 3"]]
     """In sRGB, by title."""
+    notes: tuple[str, ...] = ()
+    """What is to be said beside it."""
 
 
 def page_content(scene: ObjectForPage, resolution: int) -> PageContent:
     """What a page shows of an object; its mesh has vertices about as dense as cells of the resolution."""
     mesh = _resampled(scene.mesh, 2.0 / resolution).to(scene.mesh.vertices.device)
-    family, notes, materials = scene.surface.family, [], None
+    family, notes, materials = scene.surface.family, list(scene.notes), None
     parameters = scene.surface.parameters(mesh.vertices)
     arrays: dict[str, np.ndarray] = {}
     if isinstance(family, SpectralFamily) and scene.bands is not None:

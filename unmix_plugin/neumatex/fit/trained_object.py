@@ -182,7 +182,7 @@ class TrainedObject:
 
     @property
     def lit_head_on(self) -> TrainedObject:
-        """Itself: no lamp moves with the camera."""
+        """Itself: what is exported of it holds no light."""
         return self
 
     @property
@@ -263,6 +263,11 @@ class TrainedObject:
         view = next((view for view in self.views if view.split == "eval"), self.views[0])
         seen, eye = self.look(view.camera), view.camera.camera_to_world[0, :, 3].to(self.device)
         base_colour = linear_to_srgb(seen["base_colour"].clamp(0, 1))
+        notes = list[str]()
+        if (self.own_light or self.environment).moves is not None:
+            notes.append(
+                f"The light of the pictures turned with the camera: it is shown as it stood for {view.name}."
+            )
         shown = ObjectForPage(
             mesh=self.mesh,
             surface=self.surface,
@@ -273,6 +278,7 @@ class TrainedObject:
                 name: self.with_light(LightChoice(name)).environment.seen_from(eye) for name in self.lights
             },
             pictures={f"{view.name}, in colour": seen["rgb"], f"{view.name}, base colour": base_colour},
+            notes=tuple(notes),
         )
         return page_content(shown, resolution)
 
