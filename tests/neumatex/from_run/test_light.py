@@ -1,7 +1,7 @@
 """The light of an object from shading and shadows: a lamp, the sky, what can't be told, and what white reads."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,12 @@ import torch
 import trimesh
 
 from unmix_plugin.neumatex.from_run.light import LitPoints, find_light
-from unmix_plugin.neumatex.tracing.environment import Environment, directions_of_pixels, solid_angles
+from unmix_plugin.neumatex.tracing.environment import (
+    Environment,
+    MovingFrame,
+    directions_of_pixels,
+    solid_angles,
+)
 from unmix_plugin.neumatex.tracing.families import SpectralFamily
 from unmix_plugin.neumatex.tracing.mesh import mesh_of
 from unmix_plugin.neumatex.tracing.path_tracer import TracedObject
@@ -66,7 +71,7 @@ def _lit(environment: Environment) -> LitPoints:
     found, points = SUBJECT.seen(targets + 5 * outwards, -outwards)
     points = points.select(torch.arange(int(found.sum()))[:NUM_POINTS])
     surface = _TwoMaterials(SpectralFamily(ENDMEMBERS))
-    light = Environment(environment.image * LAMP)
+    light = replace(environment, image=environment.image * LAMP)
     spectra = TracedObject(SUBJECT, light, surface).light(points, 64, 1, drawn)
     return LitPoints(points, spectra, surface.parameters(points.positions)[:, :2])
 
@@ -123,3 +128,21 @@ def test_no_surface_is_brighter_than_white():
     found = find_light(SUBJECT, bright, ENDMEMBERS, LAMP, None)
     albedo = lit.abundances.double() @ (torch.from_numpy(found.gains)[:, None] * ENDMEMBERS.double())
     assert float(albedo.mean(dim=1).quantile(0.99)) == pytest.approx(0.95, rel=0.02)
+
+
+def test_light_that_turns_with_the_camera_is_found_in_its_frame_and_in_no_other():
+    """By what is left unexplained, which says whether light stands still."""
+    turntable = MovingFrame("turntable", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+    for moves in (None, turntable):
+        environment = replace(_environment((0.5, 0.4, 0.8)), moves=moves)
+        lit = _lit(environment)
+        assert lit.points.eyes is not None
+        still = find_light(SUBJECT, lit, ENDMEMBERS, LAMP, None)
+        turned = replace(lit, light_axes=turntable.axes(lit.points.eyes))
+        moving = find_light(SUBJECT, turned, ENDMEMBERS, LAMP, None)
+        right, wrong = (still, moving) if moves is None else (moving, still)
+        assert right.error < 0.5 * wrong.error
+        assert right.direction is not None
+        unit = np.array((0.5, 0.4, 0.8)) / np.linalg.norm((0.5, 0.4, 0.8))
+        assert float(right.direction @ unit) > math.cos(math.radians(5))
+    assert "to the camera's right" in moving.decision.outcome
