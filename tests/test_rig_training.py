@@ -142,13 +142,18 @@ def test_rays_of_a_coarse_pixel_lie_within_it(tmp_path):
         assert_close(batch["spectra"][start + pixel, :2], torch.from_numpy(cube[row, column]))
 
 
+def _but_copies(warnings: list[str]) -> list[str]:
+    """But for what is true of drawn views without noise."""
+    return [warning for warning in warnings if "the very same values" not in warning]
+
+
 def test_a_rig_says_which_sensor_is_alone_and_starts_from_the_one_with_most_channels(tmp_path):
     manager = rig_manager(tmp_path / "rig")
     data = manager.initial_data()
     assert data["pixels"].shape[1] == 4
     assert int(data["sensor"]) == 0
     np.testing.assert_allclose(data["typical"] / data["typical"][0], [1, 2.5, 4, 2], rtol=0.15)
-    assert manager.warnings() == []
+    assert _but_copies(manager.warnings()) == []
     camera, batch = manager.eval_image(0)
     assert batch["spectra"].shape == (camera.height, camera.width, 4)
     assert int(batch["sensor"]) == 0
@@ -161,7 +166,7 @@ def test_sensors_that_share_no_band_are_named(tmp_path):
         folder.edit(lambda content, index=index: content["frames"][index].update(bands=[1, 3], sensor="odd"))
     folder.edit(lambda content: content["train_filenames"].remove("images/view_5.png"))
     config = HyperspectralDataManagerConfig(grid_resolution=16)
-    [warning] = config.setup(data=folder.root, device=torch.device("cpu")).warnings()
+    [warning] = _but_copies(config.setup(data=folder.root, device=torch.device("cpu")).warnings())
     assert "no other sensor shares a band with odd, small" in warning
 
 
