@@ -105,67 +105,114 @@ def find_light(
         white: What a white surface that is lit best reads, where a reference says so; None: 1 is assumed.
     """
     seen = lit.spectra / lamp
-    wide = _fibonacci(_NUM_DIRECTIONS)
-    arriving = _arriving(ray_mesh, lit, wide)
-    patches = sky_patches(wide)
-    sky = arriving @ patches * (4 / _NUM_DIRECTIONS)  # solid angle of a direction over pi
+    search = _Search(ray_mesh, lit)
     gains = torch.ones(len(reflectances), dtype=torch.float64)
     weights = torch.ones(len(seen), dtype=torch.float64)
-    softened = arriving @ _soft(wide, wide)
-    fits, best, alone, elsewhere = [_Fit(np.zeros(NUM_PATCHES + 2), math.inf)], wide[0], math.inf, math.inf
-    chosen, mixed, shade, trust = 0, lit.abundances.double(), weights, weights
-    for number in range(_ROUNDS):
-        mixed = lit.abundances.double() @ (gains[:, None] * reflectances.double())
-        albedo = mixed.norm(dim=1)
-        shade = (seen.double() * mixed).sum(dim=1) / (albedo * albedo).clamp(min=1e-12)
-        trust = weights * albedo
-        alone = _fitted(sky, [], shade, trust)[0].error
-        errors = torch.tensor([each.error for each in _fitted(sky, [arriving, softened], shade, trust)])
-        best = wide[int(errors.argmin())]
-        far = wide @ best < math.cos(math.radians(_ELSEWHERE_DEG))
-        elsewhere = float(errors[far].min())
-        sharp, soft = arriving, softened
-        for half_angle, count in _FINER:
-            near = _cone(best, half_angle, count)
-            sharp, soft = _arriving(ray_mesh, lit, near), arriving @ _soft(wide, near)
-            fits = _fitted(sky, [sharp, soft], shade, trust)
-            chosen = min(range(count), key=lambda index: fits[index].error)
-            best = near[chosen]
-        columns = torch.cat([sky, sharp[:, [chosen]], soft[:, [chosen]]], dim=1).double()
-        light = columns @ torch.from_numpy(fits[chosen].values)
-        off = (shade - light).abs() / light.clamp(min=1e-6)
-        usual = off.median().clamp(min=1e-6) / 0.6745
-        if number < _ROUNDS - 1:
-            weights = (_HIGHLIGHTS * usual / off.clamp(min=1e-9)).clamp(max=1)
-            gains = _gains(lit.abundances, reflectances, light, seen, weights)
-    fit = fits[chosen]
+    for _ in range(_ROUNDS - 1):
+        best = search.best(_Shading.of(lit, reflectances, seen, gains, weights))
+        gains, weights = _refitted(best, lit, reflectances, seen)
+    best = search.best(_Shading.of(lit, reflectances, seen, gains, weights))
+    fit = best.fit
     share = float(fit.values[NUM_PATCHES:].sum() / max(fit.values.sum(), 1e-12))
-    is_better = fit.error < (1 - _LEAST_GAIN) * alone and elsewhere > _CLEARLY_WORSE * fit.error
+    is_better = (
+        fit.error < (1 - _LEAST_GAIN) * best.sky_alone.error and best.elsewhere > _CLEARLY_WORSE * fit.error
+    )
     is_believed = is_better and share > _LEAST_SHARE
-    evidence: dict[str, float | int | bool | str] = {
-        "squared error over that of a sky alone": fit.error / alone,
-        "best lamp elsewhere over the best": elsewhere / fit.error,
-        "lamp over all light": share,
-    }
     if not is_believed:
-        fit = _fitted(sky, [], shade, trust)[0]
-        fit = _Fit(np.append(fit.values, [0.0, 0.0]), fit.error)
-    towards = best.double().numpy()
-    scale, assumed = _scale(fit, patches, wide, best, mixed, white)
-    lamp, sky = (
+        fit = _Fit(np.append(best.sky_alone.values, [0.0, 0.0]), best.sky_alone.error)
+    scale = _scale(fit, search, best, white)
+    lobes, patches = (
         torch.from_numpy(scale * part).float()
         for part in (fit.values[NUM_PATCHES:], fit.values[:NUM_PATCHES])
     )
-    found = LampAndSky(best.float(), torch.tensor([SHARP_DEG, SOFT_DEG]), lamp, sky)
-    evidence["brightness of white"] = "assumed" if assumed else "by the white reference"
+    light = LampAndSky(best.towards.float(), torch.tensor([SHARP_DEG, SOFT_DEG]), lobes, patches)
+    towards = best.towards.double().numpy()
     decision = Decision(
         "light",
         f"a lamp at {_place(towards, lit.light_axes is not None)}, and sky" if is_believed else UNDECIDED,
-        evidence,
+        {
+            "squared error over that of a sky alone": best.fit.error / best.sky_alone.error,
+            "best lamp elsewhere over the best": best.elsewhere / best.fit.error,
+            "lamp over all light": share,
+            "brightness of white": "assumed" if white is None else "by the white reference",
+        },
         "a sky alone that explains shading and shadows nearly as well, or a lamp elsewhere that does",
         "--environment",
     )
-    return FoundLight(found, towards if is_believed else None, (gains / scale).numpy(), fit.error, decision)
+    return FoundLight(light, towards if is_believed else None, (gains / scale).numpy(), fit.error, decision)
+
+
+@dataclass(frozen=True)
+class _Shading:
+    """How much light each point seems to receive, when endmembers are as bright as `gains` says."""
+
+    mixed: Float[Tensor, "N B"]
+    """Reflectances of the points."""
+    shade: Float[Tensor, " N"]
+    """Light on each that explains its spectrum best."""
+    trust: Float[Tensor, " N"]
+    """Weights of the points: dark materials, highlights and errors of the mesh say little."""
+
+    @staticmethod
+    def of(
+        lit: LitPoints,
+        reflectances: Float[Tensor, "K B"],
+        seen: Float[Tensor, "N B"],
+        gains: Float[Tensor, " K"],
+        weights: Float[Tensor, " N"],
+    ) -> _Shading:
+        mixed = lit.abundances.double() @ (gains[:, None] * reflectances.double())
+        albedo = mixed.norm(dim=1)
+        shade = (seen.double() * mixed).sum(dim=1) / (albedo * albedo).clamp(min=1e-12)
+        return _Shading(mixed, shade, weights * albedo)
+
+
+@dataclass(frozen=True)
+class _BestLamp:
+    """The lamp and sky that explain a shading best, beside what else explains it."""
+
+    shading: _Shading
+    towards: Float[Tensor, "3"]
+    """Unit vector to the lamp."""
+    fit: _Fit
+    light: Float[Tensor, " N"]
+    """What falls on each point by the fit."""
+    sky_alone: _Fit
+    elsewhere: float
+    """Least error with a lamp more than `_ELSEWHERE_DEG` away."""
+
+
+class _Search:
+    """Lamps of every direction, tried from coarse to fine."""
+
+    def __init__(self, ray_mesh: RayMesh, lit: LitPoints) -> None:
+        self.ray_mesh, self.lit = ray_mesh, lit
+        self.directions = _fibonacci(_NUM_DIRECTIONS)
+        self.patches = sky_patches(self.directions)
+        self.arriving = _arriving(ray_mesh, lit, self.directions)
+        self.softened = self.arriving @ _soft(self.directions, self.directions)
+        self.sky = self.arriving @ self.patches * (4 / _NUM_DIRECTIONS)  # solid angle of a direction over pi
+
+    def best(self, shading: _Shading) -> _BestLamp:
+        """First over the whole sphere, then in narrowing cones about the best."""
+        sky, shade, trust = self.sky, shading.shade, shading.trust
+        sky_alone = _fitted(sky, [], shade, trust)[0]
+        sharp, soft, directions = self.arriving, self.softened, self.directions
+        fits = _fitted(sky, [sharp, soft], shade, trust)
+        errors = np.array([each.error for each in fits])
+        chosen = int(errors.argmin())
+        far = (directions @ directions[chosen]).numpy() < math.cos(math.radians(_ELSEWHERE_DEG))
+        for half_angle, count in _FINER:
+            directions = _cone(directions[chosen], half_angle, count)
+            sharp = _arriving(self.ray_mesh, self.lit, directions)
+            soft = self.arriving @ _soft(self.directions, directions)
+            fits = _fitted(sky, [sharp, soft], shade, trust)
+            chosen = min(range(count), key=lambda index: fits[index].error)
+        columns = torch.cat([sky, sharp[:, [chosen]], soft[:, [chosen]]], dim=1).double()
+        light = columns @ torch.from_numpy(fits[chosen].values)
+        return _BestLamp(
+            shading, directions[chosen], fits[chosen], light, sky_alone, float(errors[far].min())
+        )
 
 
 @dataclass(frozen=True)
@@ -215,24 +262,24 @@ def _fitted(
     return found
 
 
-def _gains(
-    abundances: Float[Tensor, "N K"],
-    reflectances: Float[Tensor, "K B"],
-    light: Float[Tensor, " N"],
-    seen: Float[Tensor, "N B"],
-    weights: Float[Tensor, " N"],
-) -> Float[Tensor, " K"]:
-    """How bright each endmember is, 1 in the mean, when so much light falls on each point."""
+def _refitted(
+    best: _BestLamp, lit: LitPoints, reflectances: Float[Tensor, "K B"], seen: Float[Tensor, "N B"]
+) -> tuple[Float[Tensor, " K"], Float[Tensor, " N"]]:
+    """How bright each endmember is, 1 in the mean, when so much light falls on each point; and weights of the points,
+    less for those that the light explains badly."""
     from scipy.optimize import nnls
 
-    lit = abundances.double() * (light * weights)[:, None]
+    off = (best.shading.shade - best.light).abs() / best.light.clamp(min=1e-6)
+    usual = off.median().clamp(min=1e-6) / 0.6745
+    weights = (_HIGHLIGHTS * usual / off.clamp(min=1e-9)).clamp(max=1)
+    shaded = lit.abundances.double() * (best.light * weights)[:, None]
     alike = reflectances.double() @ reflectances.double().T
-    gram = (lit.T @ lit) * alike
-    right = (lit * ((seen.double() * weights[:, None]) @ reflectances.double().T)).sum(dim=0)
+    gram = (shaded.T @ shaded) * alike
+    right = (shaded * ((seen.double() * weights[:, None]) @ reflectances.double().T)).sum(dim=0)
     # Endmembers that hardly any point shows stay as bright as the others.
     ridge = 1e-3 * gram.diagonal().mean()
     found, _ = nnls((gram + ridge * torch.eye(len(gram))).numpy(), (right + ridge).numpy())
-    return torch.from_numpy(found / max(found.mean(), 1e-12)).clamp(min=1e-2)
+    return torch.from_numpy(found / max(found.mean(), 1e-12)).clamp(min=1e-2), weights
 
 
 def _arriving(ray_mesh: RayMesh, lit: LitPoints, directions: Float[Tensor, "D 3"]) -> Float[Tensor, "N D"]:
@@ -274,22 +321,17 @@ def _soft(directions: Float[Tensor, "D 3"], towards: Float[Tensor, "n 3"]) -> Fl
     return lobes / lobes.sum(dim=0)
 
 
-def _scale(
-    fit: _Fit,
-    patches: Float[Tensor, "D M"],
-    wide: Float[Tensor, "D 3"],
-    towards: Float[Tensor, "3"],
-    mixed: Float[Tensor, "N B"],
-    white: float | None,
-) -> tuple[float, bool]:
-    """Factor of the light, by which reflectances are divided, and whether it is assumed."""
-    cosines = (wide @ wide.T).clamp(min=0)
-    reads = (cosines @ patches).double() @ torch.from_numpy(fit.values[:NUM_PATCHES]) * (4 / len(wide))
+def _scale(fit: _Fit, search: _Search, best: _BestLamp, white: float | None) -> float:
+    """Factor of the light, by which reflectances are divided: white reads as its reference says, or as 1."""
+    facing = (search.directions @ search.directions.T).clamp(min=0)
+    reads = (facing @ search.patches).double() @ torch.from_numpy(fit.values[:NUM_PATCHES])
+    reads = reads * (4 / len(search.directions))
     lamps = float(fit.values[NUM_PATCHES:].sum())
-    reads = reads + lamps * (wide @ towards).clamp(min=0)
-    wanted = (1.0 if white is None else white) / float(reads.max())
-    brightest = float(mixed.mean(dim=1).quantile(0.99))
-    return max(wanted, brightest / _WHITE) if white is None else wanted, white is None
+    reads = reads + lamps * (search.directions @ best.towards).clamp(min=0)
+    if white is not None:
+        return white / float(reads.max())
+    brightest = float(best.shading.mixed.mean(dim=1).quantile(0.99))
+    return max(1 / float(reads.max()), brightest / _WHITE)
 
 
 def _place(towards: Float64[np.ndarray, "3"], moves: bool) -> str:

@@ -23,7 +23,6 @@ from typing import Any
 
 import fast_simplification
 import numpy as np
-import torch
 from jaxtyping import Float64
 from PIL import Image
 
@@ -32,9 +31,7 @@ from unmix_plugin.errors import ConfigError, SceneError
 from unmix_plugin.formats.exr import write_spectral_exr
 from unmix_plugin.formats.files import hash_of, make_folder, safe_name, write_file
 from unmix_plugin.formats.meshes import write_ply
-from unmix_plugin.light.lamp import LAMP_FRAMES
-from unmix_plugin.light.search import turning_axis
-from unmix_plugin.neumatex.fit.data_manager import ObjectDataManagerConfig, PixelList
+from unmix_plugin.neumatex.fit.data_manager import ObjectDataManagerConfig
 from unmix_plugin.neumatex.fit.object_scene import (
     DECISIONS_FILE,
     LIGHT_UNKNOWN,
@@ -43,11 +40,8 @@ from unmix_plugin.neumatex.fit.object_scene import (
 )
 from unmix_plugin.neumatex.fit.settings import NeumatexModelConfig
 from unmix_plugin.neumatex.fit.start import RunMaterials
-from unmix_plugin.neumatex.from_run.light import LitPoints, find_light
-from unmix_plugin.neumatex.tracing.environment import MovingFrame
-from unmix_plugin.neumatex.tracing.lamp_and_sky import LampAndSky
+from unmix_plugin.neumatex.from_run.light_frame import FramedLight, framed_light
 from unmix_plugin.neumatex.tracing.light_files import ENVIRONMENT_SUFFIXES, read_lamp
-from unmix_plugin.neumatex.tracing.rays import RayMesh
 from unmix_plugin.scenes.demo.scene import written_once
 from unmix_plugin.scenes.folder import METRES_KEY, load_transforms, read_scene_keys, transforms_bytes
 from unmix_plugin.scenes.reading.faults import FILE_NAME, Faults, resolve_path
@@ -60,13 +54,8 @@ from unmix_plugin.trained.open_run import LoadedRun, find_scene, load_run
 from unmix_plugin.trained.run_views import positions_for_files
 from unmix_plugin.trained.surface_mesh import TriangleMesh, surface_of
 
-_NUM_POINTS, _MOST_PIXELS, _SEED = 5000, 2_000_000, 0
-"""Pixels that the light is found from, and of how many they are drawn."""
 _RECIPE_FILE, _VERSION = "made_of.json", 4
 """What a folder was made of, written last; the version of how."""
-_CLEARLY_LESS = 2 / 3
-"""Squared error of the shading in another frame over that in the run's, from which the run is taken to be wrong: on
-six objects the right frame had 0.12 to 0.46 times the least error in a wrong one."""
 _FRAME_OF_RUN_WRONG = {
     True: "warning: the run took its light to stand still, but shading on its mesh is explained by a lamp that turns "
     "with the camera, which is used; train the run again with --light camera",
@@ -165,11 +154,10 @@ def _write_object(folder: Path, recipe: ObjectRecipe, loaded: LoadedRun, say: Sa
     (folder / FILE_NAME).write_bytes(transforms_bytes({**content, **environment}))
     estimated = Estimated(has_mesh=recipe.mesh is None)
     if recipe.environment is None and not environment:
-        decision, light, moves = _write_light(folder, recipe, loaded, _white(scene), say)
-        decisions.append(decision)
-        estimated = replace(estimated, light=light)
-        if moves is not None:
-            (folder / FILE_NAME).write_bytes(transforms_bytes({**content, "environment_moves": moves}))
+        light, axes = _write_light(folder, recipe, loaded, _white(scene), say)
+        (folder / FILE_NAME).write_bytes(transforms_bytes({**content, **axes}))
+        decisions.append(light.decision)
+        estimated = replace(estimated, light=None if light.decision.is_undecided else light.light)
     estimated.write(folder)
     write_file(folder / DECISIONS_FILE, json.dumps([each.to_json() for each in decisions], indent=1).encode())
 
@@ -311,64 +299,26 @@ def _white(scene: Scene) -> float | None:
 
 def _write_light(
     folder: Path, recipe: ObjectRecipe, loaded: LoadedRun, white: float | None, say: Say
-) -> tuple[Decision, LampAndSky | None, dict[str, Any] | None]:
-    """The light that shading and shadows on the mesh tell, as an environment map of all bands; None: no lamp is
-    believed. And, where it moves with the camera, in which frame of the world it stands still, as a key has it."""
+) -> tuple[FramedLight, dict[str, Any]]:
+    """The light that shading and shadows on the mesh tell, as an environment map of all bands, and the keys of
+    transforms.json that say in which axes it stands still."""
     say("looking for its light ...")
     known = load_posed_object(folder, recipe.mesh)
     assert known.bands is not None
-    lamp = np.ones(len(known.bands)) if known.lamp is None else known.lamp
-    generator = torch.Generator().manual_seed(_SEED)
-    views, places, spectra = PixelList(known, _MOST_PIXELS, _SEED).draw(_NUM_POINTS, generator)
-    cameras = known.pictures.cameras[list(known.split.train)]
-    rays = cameras.generate_rays(views, places)
-    ray_mesh = RayMesh(known.mesh)
-    found, points = ray_mesh.seen(rays.origins, rays.directions)
     run = RunMaterials(recipe.run, loaded.materials_scene)
-    corners = known.frame.to_world(np.concatenate([np.zeros((1, 3)), np.eye(3)]))
-    abundances = run.abundances(points.positions, points.geometric_normals, corners)
-    reflectances = run.reflectances(known.bands, lamp, abundances.shape[1])
-    middle, axis = turning_axis(cameras)
-    frames = [None, *(MovingFrame(kind, middle, axis) for kind in LAMP_FRAMES)]
-    lights = []
-    for frame in frames:
-        axes = None if frame is None else frame.axes(rays.origins[found])
-        lit = LitPoints(points, spectra[found], abundances, axes)
-        lights.append(find_light(ray_mesh, lit, reflectances, torch.from_numpy(lamp).float(), white))
-    own = (1, 2) if _moves_with_camera(loaded) else (0,)
-    chosen, best = (
-        min(numbers, key=lambda number: lights[number].error) for numbers in (own, range(len(frames)))
-    )
-    contradicts = best not in own and lights[best].error < _CLEARLY_LESS * lights[chosen].error
-    chosen = best if contradicts else chosen
-    light, moves = lights[chosen], frames[chosen]
-    if contradicts:
-        say(_FRAME_OF_RUN_WRONG[moves is not None])
-    radiance = light.light.radiance().numpy() * lamp.astype(np.float32)
-    axes_of_map = "+z is the top, +x the middle column"
-    if moves is not None:
+    found = framed_light(known, run, white, run_says_moving=_moves_with_camera(loaded))
+    if found.contradicts_run:
+        say(_FRAME_OF_RUN_WRONG[found.frame is not None])
+    say(LIGHT_UNKNOWN if found.decision.is_undecided else f"light: {found.decision.outcome}")
+    keys, axes_of_map = dict[str, Any](), "+z is the top, +x the middle column"
+    if found.frame is not None:
         axes_of_map += "; x is towards the camera, y to its right, see environment_moves in transforms.json"
+        middle = known.frame.to_world(np.array([found.frame.middle]))[0]
+        moves = {"kind": found.frame.kind, "middle": middle.tolist(), "axis": list(found.frame.axis)}
+        keys["environment_moves"] = moves
     about = f"light of an object as shading and shadows on its mesh tell it; {axes_of_map}"
-    write_spectral_exr(folder / "environment.exr", radiance, known.bands, None, comments=about)
-    evidence = dict(light.decision.evidence)
-    evidence["spectrum of the lamp"] = (
-        "of the scene"
-        if known.lamp is not None
-        else "unknown, taken as flat: give --pipeline.datamanager.lamp"
-    )
-    others = [each.error for number, each in enumerate(lights) if number != chosen]
-    evidence["moves with"] = (
-        "nothing" if moves is None else "the turntable" if moves.kind == "turntable" else "the camera"
-    )
-    evidence["least squared error in another frame over this"] = min(others) / light.error
-    evidence["the run took it to move"] = _moves_with_camera(loaded)
-    key = None
-    if moves is not None:
-        middle = known.frame.to_world(np.array([moves.middle]))[0]
-        key = {"kind": moves.kind, "middle": middle.tolist(), "axis": list(moves.axis)}
-    decision = replace(light.decision, evidence=evidence)
-    say(LIGHT_UNKNOWN if decision.is_undecided else f"light: {decision.outcome}")
-    return decision, None if light.direction is None else light.light, key
+    write_spectral_exr(folder / "environment.exr", found.radiance.numpy(), known.bands, None, comments=about)
+    return found, keys
 
 
 def _copied_environment(folder: Path, scene: Scene) -> Mapping[str, Any]:
