@@ -47,6 +47,7 @@ def _neumatex() -> TrainerConfig:
             # Brightness soon comes right; shapes of spectra drift where they may move as fast (see fit.model).
             "endmembers": OptimizerConfig(lr=1e-3, final_factor=0.1),
             "gains": OptimizerConfig(lr=6e-3, final_factor=0.1),
+            "gloss": OptimizerConfig(lr=5e-2, final_factor=0.1),
             "light": OptimizerConfig(lr=2e-2, final_factor=0.1),
             "normals": OptimizerConfig(lr=1e-2, final_factor=0.1),
         },

@@ -16,14 +16,16 @@ from unmix_plugin.neumatex.tracing.rays import RayMesh, SurfacePoints
 RAYS = RayMesh(ball(4))
 
 
-def _light(towards: tuple[float, float, float] = (0.4, -0.5, 0.7)) -> LampAndSky:
+def _light(
+    towards: tuple[float, float, float] = (0.4, -0.5, 0.7), lamp: tuple[float, float] = (0.3, 0.3)
+) -> LampAndSky:
     sky = torch.tensor([0.1, 0.05, 0.05, 0.05, 0.05, 0.3, 0.0])
-    return LampAndSky(torch.tensor(towards), torch.tensor([3.0, 14.0]), torch.tensor([0.3, 0.3]), sky)
+    return LampAndSky(torch.tensor(towards), torch.tensor([3.0, 14.0]), torch.tensor(lamp), sky)
 
 
-def _seen(rays: RayMesh = RAYS) -> SurfacePoints:
-    eyes = 3 * unit(torch.randn(250, 3, generator=generator(3)))
-    targets = 0.8 * (torch.rand(250, 3, generator=generator(4)) - 0.5)
+def _seen(rays: RayMesh = RAYS, count: int = 250) -> SurfacePoints:
+    eyes = 3 * unit(torch.randn(count, 3, generator=generator(3)))
+    targets = 0.8 * (torch.rand(count, 3, generator=generator(4)) - 0.5)
     return rays.seen(eyes, unit(targets - eyes))[1]
 
 
@@ -65,7 +67,7 @@ def test_a_fit_keeps_what_white_reads_and_begins_near_where_it_was_told():
 
 def test_a_lamp_that_is_off_comes_back():
     """By the shading of a matt ball alone."""
-    points, fitted, true = _seen(), FittedLight(), _light()
+    points, fitted, true = _seen(), FittedLight(), _light(lamp=(0.54, 0.06))
     fitted.start_from(_light((0.55, -0.35, 0.7)))
     optimiser = torch.optim.Adam(fitted.parameters(), lr=0.03)
     for step in range(80):
@@ -75,20 +77,20 @@ def test_a_lamp_that_is_off_comes_back():
         loss.backward()
         optimiser.step()
     cosine = float(unit(fitted.towards.detach()[None]) @ unit(true.towards[None]).T)
-    assert math.degrees(math.acos(min(cosine, 1))) < 3  # from 13 degrees
+    assert math.degrees(math.acos(min(cosine, 1))) < 4  # from 13 degrees
 
 
 def test_normals_that_are_off_come_nearer_and_are_smooth():
     """A dent in the normals of a ball, in light that is known."""
     true, faces = RAYS.mesh.normals, RAYS.mesh.faces
     towards = unit(_light().towards[None])[0]
-    near = (true @ unit(torch.tensor([[0.9, 0.2, 0.4]])).T).clamp(min=0) ** 8
-    dented = unit(true + 0.4 * near * towards)
-    points, fitted = _seen(), FittedNormals(len(true))
+    near = (true @ unit(torch.tensor([[0.9, 0.2, 0.4]])).T).clamp(min=0) ** 60
+    dented = unit(true + 0.5 * near * towards)
+    points, fitted = _seen(count=1000), FittedNormals(len(true))
     assert_close(fitted(dented, faces), dented)
-    optimiser = torch.optim.Adam(fitted.parameters(), lr=0.04)
+    optimiser = torch.optim.Adam(fitted.parameters(), lr=0.02)
     hits = RAYS.closest(points.positions + 0.3 * points.to_eye, -points.to_eye)
-    for step in range(80):
+    for step in range(40):
         rays = RAYS.with_normals(fitted(dented, faces))
         shown = rays.points(hits, -points.to_eye)
         wanted = _shading(RAYS, _light(), points, 1000 + step).detach()
@@ -103,3 +105,11 @@ def test_normals_that_are_off_come_nearer_and_are_smooth():
     before, after = (((one - true) @ towards)[lit].square().mean() for one in (dented, found))
     assert float(after) < 0.4 * float(before)
     assert_close(found.norm(dim=1), torch.ones(len(found)))
+
+
+def test_normals_are_not_bent_as_a_whole():
+    true, faces = RAYS.mesh.normals, RAYS.mesh.faces
+    fitted = FittedNormals(len(true))
+    with torch.no_grad():
+        fitted.offsets.copy_(torch.tensor([0.3, -0.2, 0.1]).expand(len(true), 3))
+    assert_close(fitted(true, faces), true)

@@ -67,3 +67,17 @@ def test_parameters_are_in_the_unit_interval_and_log_variances_in_theirs():
     assert 0 <= parameters.min() < 0.1 < 0.9 < parameters.max() <= 1
     low, high = LOG_VARIANCE_RANGE
     assert low <= log_variance.min() <= log_variance.max() <= high
+
+
+def test_others_that_are_mixed_are_those_of_each_share_weighted():
+    drawn = torch.Generator().manual_seed(0)
+    triplane = Triplane(5, resolution=8, generator=drawn, num_shares=3, mixes_others=True)
+    assert triplane.readers.others_of_shares is not None
+    own = torch.rand(3, 2, generator=drawn)
+    with torch.no_grad():
+        triplane.planes.mul_(1e2)
+        triplane.readers.others_of_shares.copy_(own.logit())
+    shares, others = triplane.parameters_at(points(100).float()).tensor_split([3], dim=1)
+    assert_close(shares.sum(dim=1), torch.ones(100))
+    assert shares.std() > 0.1
+    assert_close(others, shares @ own)

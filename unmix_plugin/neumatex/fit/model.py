@@ -65,14 +65,16 @@ class NeumatexModel(Model):
             self.family_parts.update({"decoder": self.family.decoder, "encoder": self.family.encoder})
         generator = torch.Generator().manual_seed(_START_SEED)
         parameters, resolution = self.family.num_parameters, self.config.plane_resolution
-        self.triplane = Triplane(parameters, resolution, generator=generator, num_shares=shares)
+        mixes_gloss = self.config.refine and record.mixes_gloss and shares > 0
+        self.triplane = Triplane(parameters, resolution, generator, shares, mixes_others=mixes_gloss)
         self.light_curve = self._light_curve()
         self.anchor = nn.ModuleDict()  # under which name runs keep the prior
         if self.config.prior != "none" and not record.is_spectral:
             prior = Triplane(parameters, resolution, generator=generator).requires_grad_(False)
             self.anchor["triplane"] = prior
         if not self.config.fit_networks:
-            self.triplane.readers.requires_grad_(False)
+            self.triplane.readers.material_network.requires_grad_(False)
+            self.triplane.readers.variance_network.requires_grad_(False)
         self.curve: nn.Module = tone_curve("agx" if record.tone_mapping == "linear" else record.tone_mapping)
         if record.bands is not None:
             self.curve = SpectralDisplay(record.bands)
@@ -123,9 +125,12 @@ class NeumatexModel(Model):
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
         """Planes, networks unless they stay as they are, the camera's response where there is one, and what of the
         object was estimated."""
+        readers = self.triplane.readers
+        networks = [*readers.material_network.parameters(), *readers.variance_network.parameters()]
         return {
             "planes": [self.triplane.planes],
-            "networks": [*self.triplane.readers.parameters()] if self.config.fit_networks else [],
+            "networks": networks if self.config.fit_networks else [],
+            "gloss": [] if readers.others_of_shares is None else [readers.others_of_shares],
             "response": [*self.curve.parameters()],
             "endmembers": [] if self.endmembers is None else [self.endmembers],
             "gains": [] if self.gains is None else [self.gains],

@@ -20,13 +20,18 @@ from unmix_plugin.trained.surface_mesh import TriangleMesh
 
 _NARROWEST_DEG = 2.2
 """Of a part of the lamp: less is a part of a pixel of the map."""
-_LEAST_PATCH, _LEAST_LOBE = 0.03, 0.25
-"""Part of the sky that a patch begins with, and of the lamp a sharp or a soft lobe: from nothing none can grow."""
+_LEAST_PATCH = 0.03
+"""Part of the sky that a patch begins with: from nothing none can grow."""
+_SHARP_AT_FIRST = 0.9
+"""Part of the lamp that begins as its sharp lobe. Shading takes the glow about the sun, and light between surfaces, for
+a soft lamp; highlights tell, but only from a lamp that is sharp: begun as shading had it, the sun of an object stayed
+14 degrees wide."""
 _FIRST_SHARP_DEG = 5.0
 """With which a sharp part begins at least: a narrower one sees no gradient where highlights are wide."""
-_SMOOTHINGS = 6
-"""How often what is fitted at the vertices is averaged with that of their neighbours: a vertex alone is seen by few
-pixels of a batch, whose noise would be fitted."""
+_SMOOTHINGS, _WIDE = 6, 24
+"""How often what is fitted at the vertices is averaged with that of their neighbours, since a vertex alone is seen by
+few pixels of a batch, whose noise would be fitted; and how often again for what is taken away from it: a field has the
+shape at large right, and what is wrong with the light would bend it."""
 
 
 class FittedLight(nn.Module):
@@ -48,7 +53,8 @@ class FittedLight(nn.Module):
         self.get_buffer("white").copy_(light.white_facing_the_lamp())
         self.towards.copy_(normalize(light.towards, dim=0))
         self.log_widths.copy_(light.widths_deg.clamp(min=_FIRST_SHARP_DEG).log())
-        self.log_lamp.copy_(light.lamp.clamp(min=_LEAST_LOBE * float(light.lamp.sum())).log())
+        parts = torch.tensor([_SHARP_AT_FIRST, 1 - _SHARP_AT_FIRST]).to(light.lamp)
+        self.log_lamp.copy_((float(light.lamp.sum()) * parts).clamp(min=1e-6).log())
         self.log_sky.copy_(light.sky.clamp(min=_LEAST_PATCH * float(light.sky.sum())).log())
 
     def light(self) -> LampAndSky:
@@ -60,7 +66,8 @@ class FittedLight(nn.Module):
 
 
 class FittedNormals(nn.Module):
-    """Shading normals of a mesh's vertices: those of the mesh and what is added to them, smoothed over neighbours.
+    """Shading normals of a mesh's vertices: those of the mesh and what is added to them, dents and bumps between two
+    sizes.
 
     Source:
         Nicolet et al. 2021, Large Steps in Inverse Rendering of Geometry, for the smoothing inside the parameters.
@@ -77,10 +84,14 @@ class FittedNormals(nn.Module):
         if self._links is None or self._links[0].device != faces.device:
             self._links = _averaging(faces, len(normals))
         rows, columns, shares = self._links
-        offsets = self.offsets
-        for _ in range(_SMOOTHINGS):
-            offsets = torch.zeros_like(offsets).index_add(0, rows, shares * offsets[columns])
-        return normalize(normals + offsets, dim=1)
+
+        def averaged(offsets: Tensor, times: int) -> Tensor:
+            for _ in range(times):
+                offsets = torch.zeros_like(offsets).index_add(0, rows, shares * offsets[columns])
+            return offsets
+
+        offsets = averaged(self.offsets, _SMOOTHINGS)
+        return normalize(normals + offsets - averaged(offsets, _WIDE), dim=1)
 
 
 def _averaging(faces: Int[Tensor, "F 3"], num_vertices: int) -> tuple[Tensor, Tensor, Tensor]:

@@ -63,6 +63,9 @@ class ObjectRecord:
     """Whether the mesh was made of a run: its normals can be fitted."""
     has_estimated_light: bool = False
     """Whether the environment is a `LampAndSky` that shading told: it can be fitted."""
+    mixes_gloss: bool = False
+    """Whether roughness and specular level belong to the endmembers of a spectral material and are mixed as these are,
+    where they are free at every point otherwise. On a mesh that was estimated dents would pass for changes of gloss."""
 
     @property
     def is_spectral(self) -> bool:
@@ -94,6 +97,7 @@ class ObjectRecord:
             lamp=() if scene.lamp is None else tuple(scene.lamp.tolist()),
             has_estimated_mesh=scene.estimated.has_mesh,
             has_estimated_light=scene.estimated.light is not None,
+            mixes_gloss=scene.estimated.has_mesh or scene.estimated.light is not None,
         )
 
     def to_json(self) -> dict[str, Any]:
@@ -154,8 +158,8 @@ class NeumatexModelConfig(ModelConfig):
     """Where the fit starts and what it is held to: small is the prior of the package; none starts from a plain grey
     material. Spectral materials have no prior: they start from the pictures or from a run."""
     refine: Annotated[bool, CommonFlag] = True
-    """Fit what --from-run estimated together with the materials: the light, and the normals of the mesh. What is given
-    stays as it is."""
+    """Fit what --from-run estimated together with the materials: the light, and the normals of the mesh, with one gloss
+    for each endmember. What is given stays as it is."""
     fit_networks: bool = True
     """Fit the networks that read the planes, too. Published with a prior: the planes alone."""
     regularisation: Annotated[float, Within("[0, inf)")] = 1e-5

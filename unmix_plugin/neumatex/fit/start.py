@@ -58,11 +58,16 @@ def start_plain(triplane: Triplane, family: MaterialFamily) -> None:
     """Make a new triplane give a plain material nearly everywhere."""
     last = triplane.readers.material_network[-1]
     assert isinstance(last, nn.Linear)
-    plain, shares = _plain_parameters(family), triplane.readers.num_shares
+    plain, num_shares = _plain_parameters(family), triplane.readers.num_shares
+    shares, others = plain[:num_shares].log(), plain[num_shares:].logit()
     with torch.no_grad():
         triplane.planes.mul_(_START_PLANES)
         last.weight.mul_(_START_SPREAD)
-        last.bias.copy_(torch.cat([plain[:shares].log(), plain[shares:].logit()]))
+        if triplane.readers.others_of_shares is None:
+            last.bias.copy_(torch.cat([shares, others]))
+        else:
+            last.bias.copy_(shares)
+            triplane.readers.others_of_shares.copy_(others.expand(num_shares, -1))
 
 
 def _plain_parameters(family: MaterialFamily) -> Float[Tensor, "P"]:

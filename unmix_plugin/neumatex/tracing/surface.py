@@ -65,7 +65,11 @@ class Readers(nn.Module):
     """Two networks that read features of points: the material's parameters, and how wrong they may be."""
 
     def __init__(
-        self, num_parameters: int, generator: torch.Generator | None = None, num_shares: int = 0
+        self,
+        num_parameters: int,
+        generator: torch.Generator | None = None,
+        num_shares: int = 0,
+        mixes_others: bool = False,
     ) -> None:
         """Random networks.
 
@@ -73,12 +77,18 @@ class Readers(nn.Module):
             num_parameters: P.
             generator: Draws the weights.
             num_shares: How many of the first parameters are shares, which sum to 1.
+            mixes_others: Whether the parameters after the shares are mixed by these of one set per share, in place of
+                being free at every point.
         """
         super().__init__()
         inputs = 3 * NUM_CHANNELS + 3 + 6 * _NUM_FREQUENCIES
         self.num_parameters = num_parameters
         self.num_shares = num_shares
-        self.material_network = _network(inputs, num_parameters, generator)
+        read = num_shares if mixes_others else num_parameters
+        self.material_network = _network(inputs, read, generator)
+        others = torch.zeros(num_shares, num_parameters - num_shares)
+        self.others_of_shares = nn.Parameter(others) if mixes_others else None
+        """Logits."""
         self.variance_network = _network(inputs, num_parameters, generator)
 
     def material(self, features: Float[Tensor, "N F"]) -> Float[Tensor, "N P"]:
@@ -86,8 +96,11 @@ class Readers(nn.Module):
         raw = self.material_network(features)
         if not self.num_shares:
             return torch.sigmoid(raw)
-        shares, others = raw.tensor_split([self.num_shares], dim=-1)
-        return torch.cat([torch.softmax(shares, dim=-1), torch.sigmoid(others)], dim=-1)
+        logits, others = raw.tensor_split([self.num_shares], dim=-1)
+        shares, others = torch.softmax(logits, dim=-1), torch.sigmoid(others)
+        if self.others_of_shares is not None:
+            others = shares @ torch.sigmoid(self.others_of_shares)
+        return torch.cat([shares, others], dim=-1)
 
     def log_variance(self, features: Float[Tensor, "N F"]) -> Float[Tensor, "N P"]:
         """Log-variances within `LOG_VARIANCE_RANGE` of points whose `plane_features` are given."""
@@ -103,6 +116,7 @@ class Triplane(nn.Module):
         resolution: int = 128,
         generator: torch.Generator | None = None,
         num_shares: int = 0,
+        mixes_others: bool = False,
     ) -> None:
         """A random material, nearly the same everywhere.
 
@@ -110,12 +124,12 @@ class Triplane(nn.Module):
             num_parameters: P; 9 for the neural material, 5 for base colour, roughness and metallicity.
             resolution: R, at least 2.
             generator: Draws the planes and the networks.
-            num_shares: How many of the first parameters are shares, which sum to 1.
+            num_shares, mixes_others: As of `Readers`.
         """
         super().__init__()
         texels = (3, NUM_CHANNELS, resolution, resolution)
         self.planes = nn.Parameter(0.1 * torch.randn(texels, generator=generator))
-        self.readers = Readers(num_parameters, generator, num_shares)
+        self.readers = Readers(num_parameters, generator, num_shares, mixes_others)
 
     @staticmethod
     def filled(readers: Readers, planes: Float[Tensor, "3 C R R"], resolution: int) -> Triplane:
