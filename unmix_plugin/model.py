@@ -246,7 +246,6 @@ class UnmixModel(Model):
             self._renderer = VolumeRenderer(
                 space=UnitSpace(self.scene_box.to(self.device), self.is_unbounded),
                 skips=self.grid.skips,
-                reachable=self.grid.reachable,
                 step=self.step,
                 smallest_weight=float(config.renderer.smallest_weight),
                 residual_on_last_sample=config.losses.background == "last",

@@ -15,7 +15,6 @@ SHORT_WAY = 0.15
 RENDERER = VolumeRenderer(
     UnitSpace(SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 0.5]]))),
     skip_distances(torch.ones(CELLS, CELLS, CELLS) > 0),
-    torch.ones(CELLS, CELLS, CELLS, dtype=torch.bool),
     step=0.2,
     smallest_weight=0.0,
 )

@@ -28,7 +28,7 @@ def make(density: float = 1e-6) -> tuple[VolumeRenderer, UnmixField]:
     with torch.no_grad():
         field.table.zero_()
     cells = torch.ones(16, 16, 16)
-    return VolumeRenderer(UnitSpace(BOX, True), skip_distances(cells > 0), cells > 0, 0.05, 0.0), field
+    return VolumeRenderer(UnitSpace(BOX, True), skip_distances(cells > 0), 0.05, 0.0), field
 
 
 def rays(num_rays: int) -> RayBundle:
@@ -74,7 +74,7 @@ def test_rays_end_on_what_stands_outside_the_box():
     assert bool(inner)
     occupied = renderer.skips == 0
     occupied[4:12, 4:12, 4:12] = False  # nothing in the box
-    shell = VolumeRenderer(UnitSpace(BOX, True), skip_distances(occupied), occupied, 0.05, 0.0)
+    shell = VolumeRenderer(UnitSpace(BOX, True), skip_distances(occupied), 0.05, 0.0)
     with torch.no_grad():
         found = shell.render(field, rays(30)).coefficients
     assert (found.accumulation > 0.99).all()
@@ -176,10 +176,7 @@ def test_a_bounded_field_has_a_sky_behind_all_matter_only_where_there_is_a_backd
     assert bare.sky(rays(2)) is None
     assert not [name for name in bare.state_dict() if "sky" in name]
     field = UnmixField(SMALL, FieldSpace(BOX, 1e-9, has_backdrop=True), 3, 1)
-    reachable = torch.ones((8, 8, 8), dtype=torch.bool)
-    renderer = VolumeRenderer(
-        UnitSpace(BOX), torch.zeros((8, 8, 8), dtype=torch.uint8), reachable, 0.05, 1e-3
-    )
+    renderer = VolumeRenderer(UnitSpace(BOX), torch.zeros((8, 8, 8), dtype=torch.uint8), 0.05, 1e-3)
     bundle = rays(20)
     with torch.no_grad():
         found = renderer.render(field, bundle)

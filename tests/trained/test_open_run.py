@@ -158,3 +158,11 @@ def test_a_scene_that_was_changed_is_passed_over_and_refused_where_it_was_named(
     assert find(run) is None
     with pytest.raises(error, match=said):
         find(run, copy)
+
+
+def test_a_scene_that_is_moved_to_a_device_shows_the_same():
+    scene = scene_of(model_with())
+    moved = scene.to("cpu:0")
+    assert moved is not scene
+    assert moved.field is not scene.field
+    assert_close(moved.look(CAMERA)["spectral"], scene.look(CAMERA)["spectral"])

@@ -146,8 +146,6 @@ class VolumeRenderer:
     through contracted space, and end on the sky."""
     skips: UInt8[Tensor, "X Y Z"]
     """0 in the cells of the box that rays are sampled in; others are empty, and have what `skip_distances` says."""
-    reachable: Bool[Tensor, "X Y Z"]
-    """Cells that were not carved away before training."""
     step: float
     """Distance of samples, model units; larger outside the box of a world without end."""
     smallest_weight: float
@@ -235,13 +233,7 @@ class VolumeRenderer:
 
     def is_occupied(self, positions: Float[Tensor, "P 3"]) -> Bool[Tensor, "P"]:
         """Points in the box, in cells that rays are sampled in."""
-        return self._lie_in(self.skips == 0, positions)
-
-    def is_reachable(self, positions: Float[Tensor, "P 3"]) -> Bool[Tensor, "P"]:
-        """Points in the box, in cells that were not carved away before training."""
-        return self._lie_in(self.reachable, positions)
-
-    def _lie_in(self, cells: Bool[Tensor, "X Y Z"], positions: Float[Tensor, "P 3"]) -> Bool[Tensor, "P"]:
+        cells = self.skips == 0
         unit = self.space.to_unit(positions)
         return self.space.contains(positions) & cells[cells_at(unit, cells.shape).unbind(-1)]
 

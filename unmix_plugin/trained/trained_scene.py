@@ -153,7 +153,6 @@ def with_cells(renderer: VolumeRenderer, change: Callable[[Tensor], Tensor]) -> 
     return replace(
         renderer,
         skips=change(renderer.skips),
-        reachable=change(renderer.reachable),
         opaque_skips=None if opaque is None else change(opaque),
     )
 
@@ -391,9 +390,8 @@ class TrainedScene:
         """The same scene on another device; `self` stays where it is."""
         if torch.device(device) == self.device:
             return self
-        renderer = replace(
-            with_cells(self.renderer, lambda cells: cells.to(device)), box=self.scene_box.to(device)
-        )
+        renderer = with_cells(self.renderer, lambda cells: cells.to(device))
+        renderer = replace(renderer, space=replace(renderer.space, box=self.scene_box.to(device)))
         field = copy.deepcopy(self.field).to(device)
         unedited, errors = None if self.unedited is None else self.unedited.to(device), self.measured_errors
         return replace(
