@@ -12,7 +12,7 @@ from typing import NoReturn
 import _common
 
 from unmix_plugin.engine.model import TrainingCallback, TrainingCallbackLocation
-from unmix_plugin.engine.runs.load_run import read_scene_record
+from unmix_plugin.engine.runs.loading import read_scene_record
 from unmix_plugin.viewer.access import TrainingViewerOptions
 from unmix_plugin.viewer.rendering.scene import source_of_training
 from unmix_plugin.viewer.server import Viewer

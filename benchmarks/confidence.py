@@ -53,14 +53,14 @@ def main(options: Options) -> None:
 
 def measure(path: Path, device: str) -> tuple[str, dict[str, Any]]:
     """Scene name and figures of a run."""
-    from unmix_plugin.engine.runs.load_run import load_pipeline
+    from unmix_plugin.engine.runs.loading import load_pipeline
     from unmix_plugin.spectral.segmentation import NOTHING_ID
     from unmix_plugin.trained.evaluation import Evaluation, render_view, scene_truth, view_truth
     from unmix_plugin.trained.open_run import require_materials, snapshot
 
     loaded = load_pipeline(path, device)
     scene, name = loaded.pipeline.datamanager.scene, loaded.config.method_name  # type: ignore[attr-defined]
-    trained = require_materials(snapshot(loaded.pipeline.model, name, loaded.scene), name)
+    trained = require_materials(snapshot(loaded.pipeline.model, name, loaded.record), name)
     evaluation = Evaluation(scene_truth(scene), trained.materials.endmembers)
     confidences, ids, labels = [], [], []
     for index in scene.eval_indices:

@@ -105,7 +105,7 @@ def train(data: Path, max_seconds: float, device: str, runs: Path) -> Path:
 
 def train_seconds(run: Path) -> float:
     """How long a run was trained."""
-    from unmix_plugin.engine.runs.load_run import load_model
+    from unmix_plugin.engine.runs.loading import load_model
 
     return load_model(run, "cpu").training.train_seconds
 

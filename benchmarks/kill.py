@@ -24,7 +24,7 @@ import _machine
 import tyro
 
 from unmix_plugin.engine.runs.checkpoints import newest_complete_checkpoint
-from unmix_plugin.engine.runs.load_run import load_model
+from unmix_plugin.engine.runs.loading import load_model
 from unmix_plugin.engine.runs.run_folder import checkpoint_steps
 from unmix_plugin.errors import UnmixError
 from unmix_plugin.scenes.demo.scene import make_demo_scene

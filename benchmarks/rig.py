@@ -78,13 +78,13 @@ def train(data: Path, output_dir: Path, steps: int, device: str) -> Path:
 
 def measure(run: Path, device: str) -> np.ndarray:
     """PSNR of each band in dB, mean over the evaluation views."""
-    from unmix_plugin.engine.runs.load_run import load_pipeline
+    from unmix_plugin.engine.runs.loading import load_pipeline
     from unmix_plugin.trained.evaluation import render_view
     from unmix_plugin.trained.open_run import require_materials, snapshot
 
     loaded = load_pipeline(run, device)
     scene, name = loaded.pipeline.datamanager.scene, loaded.config.method_name  # type: ignore[attr-defined]
-    trained = require_materials(snapshot(loaded.pipeline.model, name, loaded.scene), name)
+    trained = require_materials(snapshot(loaded.pipeline.model, name, loaded.record), name)
     found = [
         psnr_of_bands(render_view(trained, scene.cameras[index]).spectra.numpy(), scene.cube(index))
         for index in scene.eval_indices

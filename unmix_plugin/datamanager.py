@@ -75,6 +75,8 @@ class HyperspectralDataManager(DataManager):
     `alpha` (H, W), `valid` (H, W) and, where the scene has them, `labels` (H, W) and `abundances` (H, W, K).
     """
 
+    config: HyperspectralDataManagerConfig
+
     def __init__(
         self, config: HyperspectralDataManagerConfig, *, data: Path, device: torch.device, seed: int = 0
     ) -> None:
@@ -83,7 +85,6 @@ class HyperspectralDataManager(DataManager):
             SceneError: the scene is missing or malformed; all its faults in one message.
         """
         super().__init__(config, data=data, device=device, seed=seed)
-        self.options = config
         if data == DEMO:
             from unmix_plugin.scenes.demo.scene import demo_scene_path
 
@@ -94,7 +95,7 @@ class HyperspectralDataManager(DataManager):
         self.eval_cameras = self.scene.cameras[list(self.scene.eval_indices)]
         self._rays = PixelRays(self.scene, device)
         preset = preset_for(self.scene.has_alpha, self.scene.is_unbounded, self.scene.has_backdrop)
-        self.config = self.options = fill_auto(
+        self.config = fill_auto(
             config,
             subpixels=1 if self._num_train_pixels > _MANY_PIXELS else 2,
             single_ray_until=preset.single_ray_until,
@@ -166,7 +167,7 @@ class HyperspectralDataManager(DataManager):
             "has_alpha": scene.has_alpha,
             "is_unbounded": scene.is_unbounded,
             "has_backdrop": scene.has_backdrop,
-            "grid_resolution": self.options.grid_resolution,
+            "grid_resolution": self.config.grid_resolution,
             "pixel_size": min(self._rays.pixel_sizes.values()),
             "subpixels": self._final_subpixels,
             "num_train_views": len(self.train_cameras),
@@ -217,7 +218,7 @@ class HyperspectralDataManager(DataManager):
         foreground = self._foreground
         if foreground is None or self.scene.is_unbounded:
             return None
-        hull = carve(self.scene, self.options.grid_resolution, foreground, cameras)
+        hull = carve(self.scene, self.config.grid_resolution, foreground, cameras)
         is_right = share_explained(self.scene, hull, foreground, cameras) >= _FAIRLY_EXPLAINED
         return torch.from_numpy(hull) if is_right else None
 
@@ -284,14 +285,14 @@ class HyperspectralDataManager(DataManager):
     @cached_property
     def _pixels(self) -> PixelTable:
         """Read when training begins: evaluation needs none of it."""
-        memory_gb = None if self.options.memory_gb == "auto" else self.options.memory_gb
+        memory_gb = None if self.config.memory_gb == "auto" else self.config.memory_gb
         return PixelTable(
             self.scene,
             self.device,
             self.scene.train_indices,
             memory_gb,
-            components=self.options.target_components,
-            mends=self.options.mend_values,
+            components=self.config.target_components,
+            mends=self.config.mend_values,
             seed=self.seed,
         )
 
@@ -301,17 +302,17 @@ class HyperspectralDataManager(DataManager):
 
     @cached_property
     def _evidence(self) -> AlphaEvidence:
-        return AlphaEvidence(self._pixels, self.scene.has_alpha and not self.options.trust_alpha)
+        return AlphaEvidence(self._pixels, self.scene.has_alpha and not self.config.trust_alpha)
 
     @cached_property
     def _judged(self) -> JudgedViews:
         given = {
             "files": self.scene.input_hashes,
             "scene": self.scene.options,
-            "options": self.options,
+            "options": self.config,
             "seed": self.seed,
         }
-        cells = self.options.grid_resolution
+        cells = self.config.grid_resolution
         return judged_once(
             JudgedViews, given, lambda: judge_views(self.scene, self._foreground, cells, self._evidence)
         )
@@ -333,12 +334,12 @@ class HyperspectralDataManager(DataManager):
         return self._rays.shares(self._pixels.shares) if self._is_rig else None
 
     def _choose_subpixels(self, step: int, progress: float) -> None:
-        is_coarse = progress < float(self.options.single_ray_until)
+        is_coarse = progress < float(self.config.single_ray_until)
         self._subpixels = 1 if is_coarse else self._final_subpixels
 
     @property
     def _final_subpixels(self) -> int:
-        return int(self.options.subpixels)
+        return int(self.config.subpixels)
 
     @property
     def _num_train_pixels(self) -> int:

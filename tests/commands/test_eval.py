@@ -19,7 +19,7 @@ from unmix_plugin.commands.export import export
 from unmix_plugin.commands.render import render
 from unmix_plugin.commands.view import view
 from unmix_plugin.engine.processes import ALONE
-from unmix_plugin.engine.runs.load_run import load_pipeline
+from unmix_plugin.engine.runs.loading import load_pipeline
 from unmix_plugin.products.evaluation import evaluate_scene
 from unmix_plugin.products.product import Job
 from unmix_plugin.products.report.report import compared_views

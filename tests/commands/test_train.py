@@ -18,7 +18,7 @@ from tests.factories.cubes import full_disk
 from unmix_plugin.commands.train import parse, train
 from unmix_plugin.commands.training import remark_on_passes, remarks_on_course
 from unmix_plugin.engine import registry
-from unmix_plugin.engine.runs.load_run import load_config, load_model
+from unmix_plugin.engine.runs.loading import load_config, load_model
 from unmix_plugin.engine.training.steps import TrainingSteps
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.spectral.library.spectra_csv import read_spectra

@@ -17,7 +17,7 @@ import torch
 from tests.factories.rgb_nerf import rgb_nerf
 from unmix_plugin.commands.entry import run_command
 from unmix_plugin.engine.pipeline import Pipeline
-from unmix_plugin.engine.runs import load_run
+from unmix_plugin.engine.runs import loading
 from unmix_plugin.engine.training.steps import (
     TrainingSteps,
     follow_training,
@@ -93,7 +93,7 @@ def name_threads(path: Path) -> None:
 
 def main(argv: list[str]) -> None:
     """Do what was asked."""
-    load_run.find_method = lambda _: rgb_nerf
+    loading.find_method = lambda _: rgb_nerf
     folder, action = Path(argv[0]), argv[1]
     atexit.register(name_threads, folder / f"threads-{os.environ['RANK']}.txt")
     config, is_second = config_for(folder), os.environ.get("RANK") == "1"
@@ -102,7 +102,7 @@ def main(argv: list[str]) -> None:
         return
     if action == "resume":
         (run,) = (folder / "outputs").glob("*/*/*")
-        config = replace(load_run.load_config(run), max_num_iterations=STEPS + 10)
+        config = replace(loading.load_config(run), max_num_iterations=STEPS + 10)
     elif action == "other-seed":
         config = replace(config, seed=5 if is_second else 4)
     elif action == "no-scene" and is_second:

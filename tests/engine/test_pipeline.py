@@ -9,7 +9,7 @@ import torch
 from tests.factories.rgb_nerf import RgbNerf
 from tests.factories.trainings import finished, quiet_trainer
 from unmix_plugin.engine.model import TrainingCallback, TrainingCallbackLocation
-from unmix_plugin.engine.runs.load_run import load_pipeline
+from unmix_plugin.engine.runs.loading import load_pipeline
 from unmix_plugin.errors import ConfigError
 
 

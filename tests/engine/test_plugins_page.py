@@ -17,7 +17,7 @@ from unmix_plugin.commands.eval import evaluate
 from unmix_plugin.commands.render import render
 from unmix_plugin.commands.train import train
 from unmix_plugin.engine import Output, outputs, registry
-from unmix_plugin.engine.runs.load_run import load_model
+from unmix_plugin.engine.runs.loading import load_model
 from unmix_plugin.formats.envi import read_header
 from unmix_plugin.scenes.demo.scene import make_demo_scene
 
@@ -50,7 +50,7 @@ def test_the_example_of_the_page_imports_public_names_only_trains_and_is_evaluat
     ended = done(train, "spectral-grid", *argv, "--max-num-iterations", 3, "--device", "cpu")
     path = Path(ended.last_line.removeprefix("run: "))
     loaded = load_model(path, "cpu")
-    view = loaded.model.get_outputs_for_camera(loaded.scene.eval_cameras[0])
+    view = loaded.model.get_outputs_for_camera(loaded.record.eval_cameras[0])
     assert view["spectral"].shape == (16, 16, 4)
 
     argv = ["--data", tmp_path / "scene", "--output-dir", tmp_path / "out", "--endmembers", 4]

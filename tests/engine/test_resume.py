@@ -13,7 +13,7 @@ import torch
 from tests.factories.rgb_nerf import BallDataManager
 from tests.factories.systems import SIGNALS_TO_END, needs_posix
 from tests.factories.trainings import call_after_step, finished, newest, quiet_trainer, stop_at
-from unmix_plugin.engine.runs.load_run import load_config
+from unmix_plugin.engine.runs.loading import load_config
 from unmix_plugin.engine.runs.run_folder import RunLock, checkpoint_steps
 from unmix_plugin.engine.training.training_control import Interrupted
 from unmix_plugin.errors import RunError

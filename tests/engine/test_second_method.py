@@ -13,7 +13,7 @@ from tests.factories.rgb_nerf import GridField, RgbNerf, RgbNerfConfig
 from tests.factories.trainings import finished, newest, quiet_trainer, stop_at
 from unmix_plugin.engine.registry import find_method
 from unmix_plugin.engine.runs.checkpoints import save_checkpoint
-from unmix_plugin.engine.runs.load_run import load_config, load_model, load_pipeline
+from unmix_plugin.engine.runs.loading import load_config, load_model, load_pipeline
 from unmix_plugin.errors import ConfigError
 
 
@@ -40,18 +40,18 @@ def test_a_finished_run_renders_from_its_folder_alone(short_config, tmp_path):
     short_config.data.rmdir()
     moved = trainer.run.path.rename(tmp_path / "elsewhere")
     loaded = load_model(moved, "cpu")
-    actual = loaded.model.get_outputs_for_camera(loaded.scene.eval_cameras[1])
+    actual = loaded.model.get_outputs_for_camera(loaded.record.eval_cameras[1])
     assert set(actual) == {"rgb", "accumulation"}
     assert torch.equal(actual["rgb"], expected["rgb"])
-    assert loaded.scene.summary == {"scene": "ball"}
-    assert len(loaded.scene.train_cameras) == 10
+    assert loaded.record.summary == {"scene": "ball"}
+    assert len(loaded.record.train_cameras) == 10
 
 
 def test_a_scene_without_evaluation_views_trains_and_opens(short_config):
     data = replace(short_config.pipeline.datamanager, eval_views=())
     trainer = finished(replace(short_config, pipeline=replace(short_config.pipeline, datamanager=data)))
     loaded = load_pipeline(trainer.run.path, "cpu")
-    assert len(loaded.scene.eval_cameras) == 0
+    assert len(loaded.record.eval_cameras) == 0
     assert loaded.pipeline.get_average_eval_image_metrics_and_images() == ({}, {})
 
 

@@ -8,7 +8,7 @@ import torch
 from tests.factories.scenes import cameras_of, look_at, ring_poses
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import SceneBox
-from unmix_plugin.engine.runs.load_run import SceneRecord
+from unmix_plugin.engine.runs.loading import SceneRecord
 from unmix_plugin.scenes.scene import Normalisation
 
 BOX = SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3]))

@@ -11,7 +11,7 @@ import torch
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
-from unmix_plugin.engine.runs.load_run import SceneRecord
+from unmix_plugin.engine.runs.loading import SceneRecord
 from unmix_plugin.field import CoefficientField
 from unmix_plugin.losses.terms import ComparedPixels
 from unmix_plugin.model import TrainingBatch, UnmixModel

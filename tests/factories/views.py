@@ -14,7 +14,7 @@ from tests.factories.cameras import cameras_at
 from tests.factories.models import BOX, make_model
 from tests.factories.scenes import ring_poses
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.runs.load_run import SceneRecord
+from unmix_plugin.engine.runs.loading import SceneRecord
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.engine.training.training_control import DeviceLock, TrainingControl
 from unmix_plugin.errors import SceneError

@@ -23,7 +23,7 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.registry import find_method
 from unmix_plugin.engine.runs.checkpoints import TrainingRecord, newest_complete_checkpoint
 from unmix_plugin.engine.runs.config_json import config_to_json
-from unmix_plugin.engine.runs.load_run import load_config
+from unmix_plugin.engine.runs.loading import load_config
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.engine.runs.run_json import RUN_FORMAT
 from unmix_plugin.engine.runs.scene_record import read_scene_record

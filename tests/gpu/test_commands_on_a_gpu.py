@@ -60,7 +60,7 @@ def gpu(monkeypatch: pytest.MonkeyPatch) -> Iterator[torch.device]:
 
 
 def _use(device: torch.device, monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in ("training.steps", "runs.load_run"):
+    for module in ("training.steps", "runs.loading"):
         monkeypatch.setattr(f"unmix_plugin.engine.{module}.resolve_device", lambda _: device)
 
 

@@ -13,7 +13,7 @@ from tests.factories.trainings import quiet_trainer, stop_at
 from unmix_plugin.engine.configs import PipelineConfig, TrainerConfig
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import rotation_matrix
-from unmix_plugin.engine.runs.load_run import load_config, load_model
+from unmix_plugin.engine.runs.loading import load_config, load_model
 from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.method_config import unmix_nerf
 from unmix_plugin.poses.refinement import PoseRefinement
@@ -101,7 +101,7 @@ def test_refined_poses_are_the_run_s_training_cameras(folder):
     trainer = trained(config_for(folder))
     loaded = load_model(trainer.run.path)
     poses: Any = loaded.model.poses
-    expected = poses.refined(loaded.scene.train_cameras)
+    expected = poses.refined(loaded.record.train_cameras)
     views = [view for view in open_run(trainer.run.path, "cpu").views if view.split == "train"]
     found = torch.cat([view.camera.camera_to_world for view in views])
     assert_close(found, expected.camera_to_world)

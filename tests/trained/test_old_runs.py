@@ -11,7 +11,7 @@ import pytest
 
 from unmix_plugin import open_run
 from unmix_plugin.engine.runs.config_json import config_to_json, flattened
-from unmix_plugin.engine.runs.load_run import load_config, load_model
+from unmix_plugin.engine.runs.loading import load_config, load_model
 from unmix_plugin.engine.runs.run_json import OLDEST_FORMAT, RUN_FORMAT, read_run_json
 
 RUNS = Path(__file__).parent / "runs"

@@ -17,7 +17,7 @@ from tests.factories.cameras import FRAME
 from tests.factories.models import BOX, NUM_BANDS
 from unmix_plugin.editing import Light, Recipe, Remove, edit_scene
 from unmix_plugin.engine.processes import ALONE
-from unmix_plugin.engine.runs.load_run import SceneRecord
+from unmix_plugin.engine.runs.loading import SceneRecord
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.engine.training.training_control import DeviceLock
 from unmix_plugin.products import spectrum as spectrum_product

@@ -30,7 +30,7 @@ from unmix_plugin.captures.cube import Capture, CaptureView
 from unmix_plugin.captures.names import match_poses
 from unmix_plugin.captures.options import ESTIMATE, LINES, MARKERS, TURNTABLE, ProcessOptions
 from unmix_plugin.captures.poses.lens import Lens
-from unmix_plugin.captures.poses.lines import read_line_poses
+from unmix_plugin.captures.poses.lines import line_table_poses
 from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera, PoseSet, where_rays_meet
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.captures.report import Code, Kind, Remark, merged, sentences
@@ -84,7 +84,7 @@ def given_poses(capture: Capture, options: ProcessOptions) -> PoseSet:
     CaptureError: there are none, or they can't be read."""
     where = options.poses
     if capture.layout == LINES:
-        return read_line_poses(capture.views, capture.root, options)
+        return line_table_poses(capture.views, capture.root, options)
     if where is None:
         if capture.poses is None:
             why = f" ({capture.no_poses})" if capture.no_poses else ""

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from unmix_plugin.engine.processes import Processes
-    from unmix_plugin.engine.runs.load_run import LoadedPipeline
+    from unmix_plugin.engine.runs.loading import LoadedPipeline
     from unmix_plugin.products.comparison import ComparedRun
     from unmix_plugin.products.evaluation import Evaluated
     from unmix_plugin.trained.trained_scene import TrainedScene
@@ -60,7 +60,7 @@ def evaluate(argv: list[str]) -> None:
 
 def _evaluate(options: _EvalOptions, processes: Processes) -> None:
     from unmix_plugin.commands.reporting import CommandConsole, chosen_run, refuse_to_look
-    from unmix_plugin.engine.runs.load_run import load_config
+    from unmix_plugin.engine.runs.loading import load_config
 
     console = CommandConsole(quiet=not processes.is_first)
     with processes.together():
@@ -116,7 +116,7 @@ def _evaluate_run(
     from unmix_plugin.editing.edited_run import requested_recipe
     from unmix_plugin.editing.recipe_files import recipe_to_yaml
     from unmix_plugin.engine.runs.config_json import config_to_json, flattened
-    from unmix_plugin.engine.runs.load_run import load_pipeline
+    from unmix_plugin.engine.runs.loading import load_pipeline
     from unmix_plugin.formats.files import safe_name
     from unmix_plugin.products.comparison import ComparedRun
     from unmix_plugin.products.evaluation import evaluate_images, evaluate_scene, evaluate_spectra
@@ -125,14 +125,14 @@ def _evaluate_run(
         recipe = requested_recipe(options.edits, options.illuminant)
         with working(console, f"reading {path} and its scene"):
             loaded = load_pipeline(path, options.device, options.data)
-        scene, folder, factors = _materials_scene(loaded, recipe is not None), loaded.run.eval, None
+        scene, folder, factors = _materials_scene(loaded, recipe is not None), loaded.folder.eval, None
         if scene is not None and recipe is not None:
             factors = None if recipe.illuminant is None else light_factors(scene, recipe)[0]
             scene = edit_scene(scene, recipe)
             for note in scene.notes:
                 tell(note)
             words = ["eval", *(Path(given).stem for given in (options.edits, options.illuminant) if given)]
-            folder = loaded.run.exports / safe_name("-".join(words))
+            folder = loaded.folder.exports / safe_name("-".join(words))
     measured = spectral_scene(loaded.pipeline.datamanager)
     shown = partial(follow, console)
     if scene is not None and measured is not None:
@@ -152,12 +152,12 @@ def _evaluate_run(
     figures = found.write(folder / "metrics.json", times)
     config = replace(loaded.config, data=None, output_dir=Path(), load_run=None)
     compared = ComparedRun(
-        loaded.run.path,
+        loaded.folder.path,
         config.method_name,
         figures,
         {view["name"]: view for view in found.per_image},
         found.bands,
-        loaded.scene.eval_cameras.camera_to_world.numpy(),
+        loaded.record.eval_cameras.camera_to_world.numpy(),
         folder,
         flattened(config_to_json(config)),
         tuple(found.more.get("aligned", ())),
@@ -234,7 +234,7 @@ def _materials_scene(loaded: LoadedPipeline, is_edited: bool) -> TrainedScene | 
 
     name, scene = loaded.config.method_name, None
     if spectral_scene(loaded.pipeline.datamanager) is not None:
-        scene = mixture_scene(loaded.pipeline.model, name, loaded.scene)
+        scene = mixture_scene(loaded.pipeline.model, name, loaded.record)
     return require_materials(scene, name) if is_edited else scene
 
 

@@ -173,7 +173,7 @@ def _shown(trainer: Trainer, viewing: TrainingViewerOptions, console: Console) -
         yield
         return
     from unmix_plugin.commands.reporting import say, spectral_scene
-    from unmix_plugin.engine.runs.load_run import read_scene_record
+    from unmix_plugin.engine.runs.loading import read_scene_record
     from unmix_plugin.viewer.rendering.scene import source_of_training
     from unmix_plugin.viewer.server import Viewer
     from unmix_plugin.viewer.session import Services

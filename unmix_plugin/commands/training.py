@@ -78,7 +78,7 @@ def first_config(method: MethodSpecification, load_run: Path | None) -> TrainerC
     """The method's defaults, or the settings of the run to go on with, which must be of this method."""
     if load_run is None:
         return method.config
-    from unmix_plugin.engine.runs.load_run import load_config
+    from unmix_plugin.engine.runs.loading import load_config
 
     config = load_config(load_run)
     if config.method_name != method.name:
@@ -199,7 +199,7 @@ def _judge_training_views(trainer: Trainer, scene: Scene, console: Console, done
     """Say, here and in run.log, which training views do not fit the others, and what the materials do not explain;
     keep how far the scene is off."""
     from unmix_plugin.commands.reporting import say, working
-    from unmix_plugin.engine.runs.load_run import read_scene_record
+    from unmix_plugin.engine.runs.loading import read_scene_record
     from unmix_plugin.engine.training.progress import write_event
     from unmix_plugin.settings import UnmixModelConfig
     from unmix_plugin.trained.measured_errors import measure_errors, write_errors

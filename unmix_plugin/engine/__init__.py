@@ -42,10 +42,10 @@ if TYPE_CHECKING:
     from unmix_plugin.engine.registry import discover_methods as discover_methods
     from unmix_plugin.engine.registry import find_method as find_method
     from unmix_plugin.engine.runs.config_json import config_from_json as config_from_json
-    from unmix_plugin.engine.runs.load_run import LoadedModel as LoadedModel
-    from unmix_plugin.engine.runs.load_run import load_config as load_config
-    from unmix_plugin.engine.runs.load_run import load_model as load_model
-    from unmix_plugin.engine.runs.load_run import load_pipeline as load_pipeline
+    from unmix_plugin.engine.runs.loading import LoadedModel as LoadedModel
+    from unmix_plugin.engine.runs.loading import load_config as load_config
+    from unmix_plugin.engine.runs.loading import load_model as load_model
+    from unmix_plugin.engine.runs.loading import load_pipeline as load_pipeline
     from unmix_plugin.engine.runs.scene_record import SceneRecord as SceneRecord
     from unmix_plugin.engine.training.trainer import Trainer as Trainer
 
@@ -74,7 +74,7 @@ _MODULES = {
     "outputs": ("Output", "named_output"),
     "registry": ("MethodSpecification", "discover_methods", "find_method"),
     "runs.config_json": ("config_from_json",),
-    "runs.load_run": ("LoadedModel", "load_config", "load_model", "load_pipeline"),
+    "runs.loading": ("LoadedModel", "load_config", "load_model", "load_pipeline"),
     "runs.scene_record": ("SceneRecord",),
     "training.trainer": ("Trainer",),
 }

@@ -14,6 +14,10 @@ def evenly_spaced(count: int, most: int) -> list[int]:
     return np.linspace(0, count - 1, min(count, most)).round().astype(int).tolist()
 
 
+SIGMA_OF_MEDIAN_DEVIATION = 1.4826
+"""Standard deviation over the median distance from the median, of normally distributed numbers."""
+
+
 def robust_deviation(values: np.ndarray, axis: int | tuple[int, ...] | None = None) -> np.ndarray:
     """Standard deviation by the median distance from the median, as of normally distributed numbers.
 
@@ -21,4 +25,4 @@ def robust_deviation(values: np.ndarray, axis: int | tuple[int, ...] | None = No
     1.4826
     """
     away = np.abs(values - np.median(values, axis=axis, keepdims=True))
-    return np.asarray(1.4826 * np.asarray(np.median(away, axis=axis), np.float64))
+    return np.asarray(SIGMA_OF_MEDIAN_DEVIATION * np.asarray(np.median(away, axis=axis), np.float64))

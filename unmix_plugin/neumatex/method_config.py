@@ -22,10 +22,10 @@ def _products() -> Sequence[Any]:
 
 
 def _complete(config: TrainerConfig) -> TrainerConfig:
-    """See `completed`; imported when a training starts."""
-    from unmix_plugin.neumatex.from_run.object_folder import completed
+    """See `with_object_made`; imported when a training starts."""
+    from unmix_plugin.neumatex.from_run.object_folder import with_object_made
 
-    return completed(config)
+    return with_object_made(config)
 
 
 def _neumatex() -> TrainerConfig:

@@ -120,13 +120,15 @@ def composite(renderer: VolumeRenderer, field: CoefficientField, ray_bundle: Ray
 
 @torch.no_grad()
 def _composite(renderer: VolumeRenderer, field: CoefficientField, ray_bundle: RayBundle) -> Coefficients:
-    found, chunk = _before_any_sky(renderer, field, ray_bundle), renderer.rays_per_chunk
+    found, chunk = _composite_field(renderer, field, ray_bundle), renderer.rays_per_chunk
     parts = [field.sky(ray_bundle[first : first + chunk]) for first in range(0, len(ray_bundle), chunk)]
     skies = [sky for sky in parts if sky is not None]
     return found.before(torch.cat(skies))[0] if skies else found
 
 
-def _before_any_sky(renderer: VolumeRenderer, field: CoefficientField, ray_bundle: RayBundle) -> Coefficients:
+def _composite_field(
+    renderer: VolumeRenderer, field: CoefficientField, ray_bundle: RayBundle
+) -> Coefficients:
     """Coefficients (R, ...) of what rays meet in the field."""
     origins, directions, smallest = ray_bundle.origins, ray_bundle.directions, renderer.smallest_weight
     limits = MergeLimits(renderer.step, smallest, _MERGED_WEIGHT * smallest)

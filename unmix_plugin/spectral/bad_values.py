@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from unmix_plugin.engine.sampling import SIGMA_OF_MEDIAN_DEVIATION
 from unmix_plugin.spectral.evidence import brightness
 from unmix_plugin.spectral.subspace import estimate_noise
 
@@ -33,7 +34,6 @@ _NOISE_SHARE = 0.7
 """Standard deviation of noise, as a share of the band's own, above which a band is mostly noise."""
 _DEAD_SPREAD, _LEAST_WEIGHT = 1e-5, 1e-4
 """Standard deviation up to which a band shows one value everywhere; and its weight, before weights are scaled."""
-_SIGMA_OF_MAD = 1.4826
 
 
 def deviations(spectra: Float[Tensor, "*pixels B"]) -> Float[Tensor, "*pixels B"]:
@@ -133,7 +133,9 @@ def judge_bands(pixels: Float[Tensor, "N B"]) -> BandNoise:
         return replace(BandNoise.unknown(num_bands), dead=dead)
     sigmas = pixels.new_zeros(num_bands)
     noise = estimate_noise(pixels[:, ~dead])
-    sigmas[~dead] = _SIGMA_OF_MAD * (noise - noise.median(dim=0).values).abs().median(dim=0).values
+    sigmas[~dead] = (
+        SIGMA_OF_MEDIAN_DEVIATION * (noise - noise.median(dim=0).values).abs().median(dim=0).values
+    )
     usual = torch.maximum(sigmas[~dead].median(), _PLAIN_NOISE * brightness(pixels[:, ~dead]).median())
     weights = (_PLAIN_FACTOR * usual / sigmas.clamp(min=1e-12)).square().clamp(_LEAST_WEIGHT, 1.0)
     weights = torch.where(dead, _LEAST_WEIGHT, weights)

@@ -15,6 +15,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from unmix_plugin.engine.sampling import SIGMA_OF_MEDIAN_DEVIATION
+
 OPAQUE_ALPHA = 0.99
 """From which on a pixel shows nothing of what is behind it."""
 DARK_RMS = 0.005
@@ -24,7 +26,6 @@ _TRANSPARENT = 0.5 / 255
 _BLOWN_OUT = 0.9
 _SIGMAS = 6.0
 """Standard deviations of the background's noise above its median that still count as background."""
-_SIGMA_OF_MAD = 1.4826
 _DARK_SHARE = 0.5
 """The background must be darker than this share of the median brightness of what is not background."""
 _FAINTEST_SURPLUS = 0.02
@@ -70,7 +71,7 @@ def background_level(spectra: Float[Tensor, "R B"], alpha: Float[Tensor, "R"]) -
     if len(background) == 0 or len(foreground) == 0:
         return None
     median = background.median()
-    deviation = _SIGMA_OF_MAD * (background - median).abs().median()
+    deviation = SIGMA_OF_MEDIAN_DEVIATION * (background - median).abs().median()
     level = float(median + _SIGMAS * deviation)
     return level if level < _DARK_SHARE * float(foreground.median()) else None
 

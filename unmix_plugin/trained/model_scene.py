@@ -16,7 +16,7 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.engine.model import Model
 from unmix_plugin.engine.outputs import Output, named_output
-from unmix_plugin.engine.runs.load_run import SceneRecord
+from unmix_plugin.engine.runs.loading import SceneRecord
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.bands import Bands

@@ -16,7 +16,7 @@ from unmix_plugin.engine.configs import TrainerConfig
 from unmix_plugin.engine.model import Model
 from unmix_plugin.engine.registry import discover_methods, find_method
 from unmix_plugin.engine.runs.checkpoints import TrainingRecord
-from unmix_plugin.engine.runs.load_run import SceneRecord, load_model, read_config
+from unmix_plugin.engine.runs.loading import SceneRecord, load_model, read_config
 from unmix_plugin.engine.runs.run_folder import RunFolder, open_run_folder
 from unmix_plugin.engine.runs.scene_record import differences, name_differences, read_scene_record
 from unmix_plugin.errors import ConfigError, RunError, SceneError
@@ -145,17 +145,20 @@ def load_run(path: str | Path, device: str = "auto") -> LoadedRun:
         ConfigError: the device is not there, or the method is not installed.
     """
     loaded = load_model(Path(path), device)
-    scene = snapshot(loaded.model, loaded.config.method_name, loaded.scene)
-    run = LoadedRun(
-        loaded.run, loaded.config, loaded.scene, loaded.training, scene, read_measures(loaded.run)
-    )
+    folder, record = loaded.folder, loaded.record
+    scene = snapshot(loaded.model, loaded.config.method_name, record)
+    run = LoadedRun(folder, loaded.config, record, loaded.training, scene, read_measures(folder))
     if not isinstance(scene, TrainedScene):
         return run
     shape = (len(scene.bands), len(scene.materials.names))
-    errors = read_errors(loaded.run.path, loaded.training.steps, *shape)
-    errors = errors if isinstance(errors, str) else errors.map(lambda values: values.to(scene.device))
-    known = {"measured_errors": errors, "unexplained": read_unexplained_map(loaded.run.path)}
-    return replace(run, scene=replace(scene, scale=run.scale, **known))
+    errors = read_errors(folder.path, loaded.training.steps, *shape)
+    scene = replace(
+        scene,
+        scale=run.scale,
+        measured_errors=errors if isinstance(errors, str) else errors.map(lambda one: one.to(scene.device)),
+        unexplained=read_unexplained_map(folder.path),
+    )
+    return replace(run, scene=scene)
 
 
 def open_run(path: str | Path, device: str = "auto") -> TrainedScene:

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float, Float32, Float64
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.runs.load_run import SceneRecord
+from unmix_plugin.engine.runs.loading import SceneRecord
 from unmix_plugin.errors import ConfigError, RunError, did_you_mean
 from unmix_plugin.scenes.scene import Normalisation
 

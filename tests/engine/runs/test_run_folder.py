@@ -17,7 +17,7 @@ from tests.factories.rgb_nerf import RgbNerfConfig
 from tests.factories.trainings import quiet_trainer
 from unmix_plugin.engine.runs.atomic_files import whole_file, write_file
 from unmix_plugin.engine.runs.checkpoints import save_checkpoint
-from unmix_plugin.engine.runs.load_run import load_config, load_model, load_pipeline
+from unmix_plugin.engine.runs.loading import load_config, load_model, load_pipeline
 from unmix_plugin.engine.runs.run_folder import RunFolder, create_run_folder, newest_run, open_run_folder
 from unmix_plugin.engine.runs.run_json import OLDEST_FORMAT, RUN_FORMAT, write_run_json
 from unmix_plugin.engine.runs.scene_record import differences

@@ -16,7 +16,7 @@ from tests.factories.trainings import finished, newest, quiet_trainer, stop_at
 from unmix_plugin.engine.configs import PipelineConfig, TrainerConfig
 from unmix_plugin.engine.machine import operations_shared_among
 from unmix_plugin.engine.model import Model
-from unmix_plugin.engine.runs.load_run import load_config
+from unmix_plugin.engine.runs.loading import load_config
 from unmix_plugin.engine.training.batches import work_on_batches
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.method_config import unmix_nerf

@@ -20,7 +20,7 @@ from unmix_plugin.engine.configs import OptimizerConfig, TrainerConfig
 from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.engine.model import TrainingCallback, TrainingCallbackLocation, TrainOutputs
 from unmix_plugin.engine.runs.checkpoints import newest_complete_checkpoint
-from unmix_plugin.engine.runs.load_run import load_model
+from unmix_plugin.engine.runs.loading import load_model
 from unmix_plugin.engine.training.optimizers import (
     GradientGuard,
     ParameterAverage,

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from unmix_plugin.engine.configs import TrainerConfig
-from unmix_plugin.engine.runs.load_run import load_config
+from unmix_plugin.engine.runs.loading import load_config
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.engine.training import trainer as trainer_module
 from unmix_plugin.engine.training.progress import (

@@ -12,7 +12,7 @@ import torch
 from rich.console import Console
 
 from tests.factories.trainings import call_after_step, newest, quiet_trainer
-from unmix_plugin.engine.runs.load_run import load_config
+from unmix_plugin.engine.runs.loading import load_config
 from unmix_plugin.engine.runs.run_folder import checkpoint_steps
 from unmix_plugin.engine.training import training_control as device_share
 from unmix_plugin.engine.training.trainer import Trainer

@@ -320,7 +320,7 @@ def test_the_gradient_of_a_gain_is_that_of_all_bands_of_its_endmember_together()
 
 def test_training_that_goes_on_does_not_change_a_scene(neural):
     loaded = load_model(neural, "cpu")
-    scene = snapshot(loaded.model, "neumatex", loaded.scene)
+    scene = snapshot(loaded.model, "neumatex", loaded.record)
     assert isinstance(scene, TrainedObject)
     camera, names = scene.views[0].camera, ["base_colour", "latents_a", "uncertainty"]
     before = scene.render(camera, names)
@@ -328,5 +328,5 @@ def test_training_that_goes_on_does_not_change_a_scene(neural):
         for param in loaded.model.parameters():
             param.add_(0.5)
     assert_close(scene.render(camera, names), before, rtol=0, atol=0)
-    changed = snapshot(loaded.model, "neumatex", loaded.scene).render(camera, ["base_colour"])
+    changed = snapshot(loaded.model, "neumatex", loaded.record).render(camera, ["base_colour"])
     assert not torch.equal(changed["base_colour"], before["base_colour"])

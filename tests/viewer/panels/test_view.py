@@ -11,7 +11,7 @@ from tests.factories.rgb_nerf import RgbNerf, RgbNerfConfig
 from tests.factories.viewers import decoded, has_control, opened, serving, show_layer
 from tests.factories.views import BOX, ring
 from unmix_plugin.engine.outputs import Output
-from unmix_plugin.engine.runs.load_run import SceneRecord
+from unmix_plugin.engine.runs.loading import SceneRecord
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.engine.training.training_control import DeviceLock
 from unmix_plugin.formats.files import eight_bits

@@ -56,7 +56,7 @@ _WIDEST_GAP = 10.0
 _Lines = Float64[np.ndarray, "H 3 4"]
 
 
-def read_line_poses(views: Sequence[CaptureView], root: Path, options: ProcessOptions) -> PoseSet:
+def line_table_poses(views: Sequence[CaptureView], root: Path, options: ProcessOptions) -> PoseSet:
     """The poses of all scans that tables tell, with the lens that the options say.
 
     Args:

@@ -25,7 +25,7 @@ from unmix_plugin.engine.runs.checkpoints import (
     restore_training,
 )
 from unmix_plugin.engine.runs.config_json import config_to_json
-from unmix_plugin.engine.runs.load_run import require_data
+from unmix_plugin.engine.runs.loading import require_data
 from unmix_plugin.engine.runs.run_folder import open_run_folder
 from unmix_plugin.engine.training.batches import mean_values, work_on_batches
 from unmix_plugin.engine.training.optimizers import (

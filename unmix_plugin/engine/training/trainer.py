@@ -25,7 +25,7 @@ from unmix_plugin.engine.runs.checkpoints import (
     save_checkpoint,
 )
 from unmix_plugin.engine.runs.config_json import require_kept
-from unmix_plugin.engine.runs.load_run import read_config, require_data, write_config
+from unmix_plugin.engine.runs.loading import read_config, require_data, write_config
 from unmix_plugin.engine.runs.replacing import remove
 from unmix_plugin.engine.runs.run_folder import (
     RunFolder,

@@ -43,7 +43,13 @@ from unmix_plugin.neumatex.fit.start import RunMaterials
 from unmix_plugin.neumatex.from_run.light_frame import FramedLight, framed_light
 from unmix_plugin.neumatex.tracing.light_files import ENVIRONMENT_SUFFIXES, read_lamp
 from unmix_plugin.scenes.demo.scene import written_once
-from unmix_plugin.scenes.folder import METRES_KEY, load_transforms, read_scene_keys, transforms_bytes
+from unmix_plugin.scenes.folder import (
+    METRES_KEY,
+    SceneKeys,
+    load_transforms,
+    read_scene_keys,
+    transforms_bytes,
+)
 from unmix_plugin.scenes.reading.faults import FILE_NAME, Faults, resolve_path
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.settings import UnmixModelConfig
@@ -145,7 +151,10 @@ def _write_object(folder: Path, recipe: ObjectRecipe, loaded: LoadedRun, say: Sa
     decisions = list[Decision]()
     if recipe.mesh is None:
         decisions.append(_write_mesh(folder, recipe, loaded, say))
-    environment = {} if recipe.environment is not None else _copied_environment(folder, scene)
+    faults = Faults(scene.root)
+    keys = read_scene_keys(load_transforms(scene.root, faults).scene, faults)
+    faults.raise_if_any()
+    environment = {} if recipe.environment is not None else _copied_environment(folder, scene, keys)
     if environment and _moves_with_camera(loaded):
         raise ConfigError(
             f"{recipe.run}: its light moves with the camera, and the environment map of the scene's folder stands "
@@ -154,7 +163,8 @@ def _write_object(folder: Path, recipe: ObjectRecipe, loaded: LoadedRun, say: Sa
     (folder / FILE_NAME).write_bytes(transforms_bytes({**content, **environment}))
     estimated = Estimated(has_mesh=recipe.mesh is None)
     if recipe.environment is None and not environment:
-        light, axes = _write_light(folder, recipe, loaded, _white(scene), say)
+        white = None if keys.reflectance_of_1 is None else 1 / keys.reflectance_of_1
+        light, axes = _write_light(folder, recipe, loaded, white, say)
         (folder / FILE_NAME).write_bytes(transforms_bytes({**content, **axes}))
         decisions.append(light.decision)
         estimated = replace(estimated, light=None if light.decision.is_undecided else light.light)
@@ -291,17 +301,12 @@ def _moves_with_camera(loaded: LoadedRun) -> bool:
     return isinstance(model, UnmixModelConfig) and model.light == "camera"
 
 
-def _white(scene: Scene) -> float | None:
-    """What a white surface reads in the pictures, where they were divided by a white reference; None: unknown."""
-    keys = read_scene_keys(load_transforms(scene.root, Faults(scene.root)).scene, Faults(scene.root))
-    return None if keys.reflectance_of_1 is None else 1 / keys.reflectance_of_1
-
-
 def _write_light(
     folder: Path, recipe: ObjectRecipe, loaded: LoadedRun, white: float | None, say: Say
 ) -> tuple[FramedLight, dict[str, Any]]:
     """The light that shading and shadows on the mesh tell, as an environment map of all bands, and the keys of
-    transforms.json that say in which axes it stands still."""
+    transforms.json that say in which axes it stands still. The folder is read back, so what it holds so far has to be
+    whole. `white` is what a white surface reads in the pictures, where they were divided by a white reference."""
     say("looking for its light ...")
     known = load_posed_object(folder, recipe.mesh)
     assert known.bands is not None
@@ -321,10 +326,9 @@ def _write_light(
     return found, keys
 
 
-def _copied_environment(folder: Path, scene: Scene) -> Mapping[str, Any]:
+def _copied_environment(folder: Path, scene: Scene, keys: SceneKeys) -> Mapping[str, Any]:
     """The environment map of a scene's folder as keys of transforms.json; nothing where there is none."""
     faults = Faults(scene.root)
-    keys = read_scene_keys(load_transforms(scene.root, faults).scene, faults)
     found = [scene.root / f"environment{suffix}" for suffix in ENVIRONMENT_SUFFIXES]
     path = next((path for path in found if path.is_file()), None)
     if keys.environment_path is not None:
@@ -341,7 +345,7 @@ def _copied_environment(folder: Path, scene: Scene) -> Mapping[str, Any]:
     return {"environment_path": name, **{key: value for key, value in placement.items() if value is not None}}
 
 
-def completed(config: TrainerConfig) -> TrainerConfig:
+def with_object_made(config: TrainerConfig) -> TrainerConfig:
     """Settings with the object's folder as data, which is made of --from-run where no data is given; files that they
     name are found from any working directory then. Errors are those of `object_of_run`."""
     model, data = config.pipeline.model, config.pipeline.datamanager

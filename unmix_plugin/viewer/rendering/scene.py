@@ -19,7 +19,7 @@ from torch import Tensor
 
 from unmix_plugin.editing import Recipe, changes_geometry, edit_scene
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.runs.load_run import SceneRecord
+from unmix_plugin.engine.runs.loading import SceneRecord
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.engine.training.training_control import DeviceLock, TrainingControl

@@ -28,11 +28,11 @@ from unmix_plugin.errors import ConfigError, RunError, UnmixError, UnmixWarning,
 class LoadedModel:
     """A trained model, brought back without its data."""
 
-    run: RunFolder
+    folder: RunFolder
     config: TrainerConfig
     model: Model
     """On the device asked for, in evaluation mode, with the averaged parameters where the run has them."""
-    scene: SceneRecord
+    record: SceneRecord
     training: TrainingRecord
     """How long it was trained."""
 
@@ -41,11 +41,11 @@ class LoadedModel:
 class LoadedPipeline:
     """A trained model and its data."""
 
-    run: RunFolder
+    folder: RunFolder
     config: TrainerConfig
     pipeline: Pipeline
     """Its model as in `LoadedModel`."""
-    scene: SceneRecord
+    record: SceneRecord
     training: TrainingRecord
 
 
