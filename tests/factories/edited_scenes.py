@@ -64,5 +64,4 @@ def tensors_of(scene: TrainedScene) -> dict[str, Tensor]:
         "specular_spectra": materials.specular_spectra,
         "light": materials.light,
         "skips": renderer.skips,
-        "reachable": renderer.reachable,
     }
