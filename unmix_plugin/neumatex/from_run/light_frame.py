@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from unmix_plugin.engine import Decision
+from unmix_plugin.engine import Cameras, Decision
 from unmix_plugin.light.lamp import LAMP_FRAMES
 from unmix_plugin.light.search import turning_axis
 from unmix_plugin.neumatex.fit.data_manager import PixelList
@@ -29,8 +29,6 @@ _NUM_POINTS, _MOST_PIXELS, _SEED = 5000, 2_000_000, 0
 _CLEARLY_LESS = 2 / 3
 """Squared error of the shading in another frame over that in the run's, from which the run is taken to be wrong: on
 six objects the right frame had 0.12 to 0.46 times the least error in a wrong one."""
-
-
 _SPECTRUM = {True: "of the scene", False: "unknown, taken as flat: give --pipeline.datamanager.lamp"}
 _MOVES_WITH = {None: "nothing", "turntable": "the turntable", "camera": "the camera"}
 
@@ -62,18 +60,19 @@ def framed_light(
         run_says_moving: Whether the run was trained with light that moves with the camera.
     """
     assert known.bands is not None
-    ray_mesh = RayMesh(known.mesh)
-    lit, eyes = _seen_points(known, ray_mesh, run)
+    ray_mesh, cameras = RayMesh(known.mesh), known.pictures.cameras[list(known.split.train)]
+    lit, eyes = _seen_points(known, cameras, ray_mesh, run)
     lamp = np.ones(len(known.bands)) if known.lamp is None else known.lamp
+    power = torch.from_numpy(lamp).float()
     reflectances = run.reflectances(known.bands, lamp, lit.abundances.shape[1])
-    middle, axis = turning_axis(known.pictures.cameras[list(known.split.train)])
+    middle, axis = turning_axis(cameras)
     frames = [None, *(MovingFrame(kind, middle, axis) for kind in LAMP_FRAMES)]
     lights = [
         find_light(
             ray_mesh,
             replace(lit, light_axes=None if frame is None else frame.axes(eyes)),
             reflectances,
-            torch.from_numpy(lamp).float(),
+            power,
             white,
         )
         for frame in frames
@@ -94,7 +93,7 @@ def framed_light(
     }
     return FramedLight(
         light=found.light,
-        radiance=found.light.radiance() * torch.from_numpy(lamp).float(),
+        radiance=found.light.radiance() * power,
         frame=frame,
         contradicts_run=contradicts,
         decision=replace(found.decision, evidence=evidence),
@@ -102,12 +101,12 @@ def framed_light(
 
 
 def _seen_points(
-    known: PosedObject, ray_mesh: RayMesh, run: RunMaterials
+    known: PosedObject, cameras: Cameras, ray_mesh: RayMesh, run: RunMaterials
 ) -> tuple[LitPoints, Float[Tensor, "N 3"]]:
     """Points of the surface that training pixels show, and where each was seen from."""
     generator = torch.Generator().manual_seed(_SEED)
     views, places, spectra = PixelList(known, _MOST_PIXELS, _SEED).draw(_NUM_POINTS, generator)
-    rays = known.pictures.cameras[list(known.split.train)].generate_rays(views, places)
+    rays = cameras.generate_rays(views, places)
     found, points = ray_mesh.seen(rays.origins, rays.directions)
     corners = known.frame.to_world(np.concatenate([np.zeros((1, 3)), np.eye(3)]))
     abundances = run.abundances(points.positions, points.geometric_normals, corners)
